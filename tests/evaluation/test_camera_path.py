@@ -83,12 +83,15 @@ def test_looking_gives_the_rotation_of_the_tests_own_camera() -> None:
     torch.testing.assert_close(looking(camera, eye, target, down, rig).viewmat, look_at(eye, target))
 
 
-def test_a_free_camera_cuts_nothing_that_the_rig_shows() -> None:
+def test_a_near_plane_stays_where_it_is_for_who_advances_and_at_its_distance_for_who_steps_aside() -> None:
     rig = arc_rig(4)
     camera = rig["cam02"]
-    forward = camera.viewmat[2, :3]
+    right, down, forward = camera.viewmat[:3, :3]
     assert free_near(rig, camera.center) == camera.near
     # From a little ahead, what lies just beyond the camera's near plane is still drawn.
     assert free_near(rig, camera.center + 0.04 * forward) == pytest.approx(camera.near - 0.04)
-    for distance in (0.2, 1.0, 2.9):
+    for distance in (0.2, 1.0):
         assert free_near(rig, camera.center + distance * forward) == pytest.approx(0.01 * camera.near)
+    for aside in (0.1 * right, -0.1 * down, -0.3 * forward, 0.1 * right - 0.3 * forward):
+        assert free_near(rig, camera.center + aside) == pytest.approx(camera.near)
+    assert free_near(rig, camera.center + 0.1 * right + 0.04 * forward) == pytest.approx(camera.near - 0.04)

@@ -88,14 +88,15 @@ def look_at(eye: Tensor, target: Tensor, down: Tensor) -> Tensor:
 
 
 def free_near(rig: CameraRig, eye: Tensor) -> float:
-    """The near plane of a free camera at ``eye`` ``[3]``, which cuts nothing that the rig's cameras show.
+    """The near plane of a free camera at ``eye`` ``[3]``: that of the nearest camera of the rig, which stays where it is
+    if the free camera advances along that camera's axis.
 
-    The rig's cameras show nothing nearer than their own near plane, so a ball of that radius around each need not be
-    drawn. The near plane decreases with the distance of the free camera from its nearest camera.
+    Beside the cameras it keeps its distance: between the cameras of a dome, the eye is in the wall that other cameras
+    see.
     """
-    distances = (rig.centers - eye).norm(dim=1)
-    near = list(rig.cameras.values())[int(distances.argmin())].near
-    return max(near - float(distances.min()), MIN_NEAR_SHARE * near)
+    nearest = list(rig.cameras.values())[int((rig.centers - eye).norm(dim=1).argmin())]
+    advance = float((eye - nearest.center) @ nearest.viewmat[2, :3])
+    return max(nearest.near - max(advance, 0.0), MIN_NEAR_SHARE * nearest.near)
 
 
 def central_camera(rig: CameraRig) -> str:

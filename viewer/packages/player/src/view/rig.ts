@@ -4,8 +4,10 @@
 import type { StreamHeader } from "@structgstream/core";
 import {
   along,
+  axes,
   type Camera,
   center,
+  dot,
   focusPoint,
   length,
   mean,
@@ -35,14 +37,14 @@ export interface Rig {
 const MIN_NEAR_SHARE = 0.01;
 
 /**
- * Near plane of a camera at `eye`, in scene units. The near plane of the capture applies to its cameras. The nearest
- * one's, minus the distance to it, cuts nothing that the rig shows (docs/conventions.md).
+ * Near plane of a camera at `eye`, in scene units: that of the nearest camera of the rig, which stays where it is if the
+ * eye advances along that camera's axis (docs/conventions.md). Beside the cameras it keeps its distance.
  */
 export function nearPlane({ cameras }: Pick<Rig, "cameras">, eye: Vector): number {
   const away = ({ camera }: RigCamera) => length(along(eye, center(camera), -1));
-  const nearest = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
-  const { near } = nearest.camera;
-  return Math.max(near - away(nearest), MIN_NEAR_SHARE * near);
+  const { camera } = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
+  const advance = dot(along(eye, center(camera), -1), axes(camera)[2]);
+  return Math.max(camera.near - Math.max(advance, 0), MIN_NEAR_SHARE * camera.near);
 }
 
 export function rigOf(header: StreamHeader): Rig {
