@@ -75,3 +75,25 @@ def test_a_singular_pose_names_the_camera(tmp_path: Path) -> None:
     edit(tmp_path, lambda content: content["cams"].__setitem__(1, [[0.0] * 4] * 4))
     with pytest.raises(CalibrationError, match=r"'cam01' of .*cameras\.json cannot be read .*expected a pose"):
         open_json_videos(tmp_path)
+
+
+def of_twice_the_size(content: dict[str, Any]) -> None:
+    content.update(width=2 * content["width"], height=2 * content["height"])
+    for camera in content["cameras"].values():
+        camera["K"] = [[2.0 * number for number in row] for row in camera["K"][:2]] + [[0.0, 0.0, 1.0]]
+
+
+def test_smaller_pictures_than_the_calibration_is_for(tmp_path: Path) -> None:
+    rig = write_clip(tmp_path)
+    edit(tmp_path, of_twice_the_size)
+    source = open_json_videos(tmp_path)
+    for name in rig:
+        assert (source.rig[name].width, source.rig[name].height) == (rig[name].width, rig[name].height)
+        torch.testing.assert_close(source.rig[name].K, rig[name].K)
+
+
+def test_pictures_of_other_proportions(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    edit(tmp_path, lambda content: content.update(height=content["height"] + 16))
+    with pytest.raises(CalibrationError, match=r"'cam00' have .*cameras\.json is for .*: other proportions"):
+        open_json_videos(tmp_path)

@@ -49,7 +49,8 @@ def test_a_log_holds_every_attempt_and_the_ending_only_the_last(tmp_path: Path) 
     assert log.read_text() == "ouch\n" * 3
 
 
-def test_a_place_gives_threads_and_hides_other_gpus() -> None:
+def test_a_place_gives_threads_and_hides_other_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     words = ("sh", "-c", "echo $OMP_NUM_THREADS/$CUDA_VISIBLE_DEVICES/$OURS")
     with local(1, gpu=5) as executor:
         executor.submit(Task("with", words, environment={"OURS": "1"}), gpus=1)
@@ -57,6 +58,13 @@ def test_a_place_gives_threads_and_hides_other_gpus() -> None:
         endings = all_endings(executor)
     assert endings["with"].output == "1/5/1\n"
     assert endings["without"].output == "1//\n"
+
+
+@pytest.mark.parametrize(("visible", "second"), [("2, 3", "3"), ("GPU-8932f937,GPU-46123a21,-1", "GPU-46123a21")])
+def test_gpus_are_of_those_that_this_process_sees(monkeypatch: pytest.MonkeyPatch, visible: str, second: str) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert WorkerSlot(1, gpu=1).environment(gpus=1)["CUDA_VISIBLE_DEVICES"] == second
+    assert WorkerSlot(1, gpu=1).environment()["CUDA_VISIBLE_DEVICES"] == ""
 
 
 def test_a_task_without_a_gpu_leaves_it_to_those_that_need_one(tmp_path: Path) -> None:

@@ -124,6 +124,22 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
     return camera
 
 
+def at_picture_size(camera: Camera, size: tuple[int, int], *, name: str, where: Path) -> Camera:
+    """``camera`` of the calibration ``where`` for its pictures of ``size``, width and height: a uniform reduction.
+
+    Raises:
+        CalibrationError: the pictures have other proportions, so what was cropped is unknown.
+    """
+    width, height = size
+    if abs(height - camera.height * width / camera.width) > 1:
+        raise CalibrationError(
+            f"The pictures of camera {name!r} have {width}x{height} pixels, {where} is for "
+            f"{camera.width}x{camera.height}: other proportions, so they are not a reduction; use pictures of the mode "
+            "that was calibrated, or calibrate it."
+        )
+    return camera.resized(width, height)
+
+
 def calibrated_rig(
     cameras: Mapping[str, Camera], held_out: Collection[str], *, where: Path, near: float | None = None
 ) -> CameraRig:

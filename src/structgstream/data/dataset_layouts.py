@@ -48,6 +48,7 @@ from structgstream.data.calibration import (
     Calibration,
     PosedCamera,
     alignment,
+    at_picture_size,
     calibrated_camera,
     calibrated_rig,
     calibration_of,
@@ -280,7 +281,12 @@ def open_json_videos(path: Path) -> VideoSource:
     rig, fps, stated_frames = read_cameras(file)
     videos = next(filter(None, map(videos_in, roots_of(path))), {})
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
-    source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
+    tracks = scan_videos({name: videos[name] for name in rig})
+    cameras = {
+        name: at_picture_size(rig[name], (track.width, track.height), name=name, where=file)
+        for name, track in tracks.items()
+    }
+    source = synchronised(tracks, replace(rig, cameras=cameras), where=path, fps=fps)
     if len(source) < stated_frames:
         raise CaptureError(
             f"The videos of {path} share {len(source)} frames, {CAMERAS_FILE} states {stated_frames}; "

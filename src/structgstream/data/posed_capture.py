@@ -26,6 +26,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import (
     Calibration,
     PosedCamera,
+    at_picture_size,
     calibrated_camera,
     calibrated_rig,
     check_held_out,
@@ -347,13 +348,7 @@ def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibra
         posed = poses[name]
         width, height = posed.size or size
         camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
-        if abs(size[1] - height * size[0] / width) > 1:
-            raise CalibrationError(
-                f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: "
-                "other proportions, so they are not a reduction; use pictures of the mode that was calibrated, or "
-                "calibrate it."
-            )
-        filmed[name] = LensCamera(camera.resized(*size), posed.lens)
+        filmed[name] = LensCamera(at_picture_size(camera, size, name=name, where=where), posed.lens)
     return filmed
 
 

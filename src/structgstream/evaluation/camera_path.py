@@ -88,11 +88,10 @@ def look_at(eye: Tensor, target: Tensor, down: Tensor) -> Tensor:
 
 
 def free_near(rig: CameraRig, eye: Tensor) -> float:
-    """The near plane of a free camera at ``eye`` ``[3]``: that of the nearest camera of the rig, which stays where it is
-    if the free camera advances along that camera's axis.
+    """The near plane of a free camera at ``eye`` ``[3]``: that of the nearest camera of the rig.
 
-    Beside the cameras it keeps its distance: between the cameras of a dome, the eye is in the wall that other cameras
-    see.
+    It stays where it is if the free camera advances along that camera's axis. Beside the cameras it keeps its distance:
+    between the cameras of a dome, the eye is in the wall that other cameras see.
     """
     nearest = list(rig.cameras.values())[int((rig.centers - eye).norm(dim=1).argmin())]
     advance = float((eye - nearest.center) @ nearest.viewmat[2, :3])

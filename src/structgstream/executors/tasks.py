@@ -77,15 +77,19 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENC
 
 @dataclass(frozen=True)
 class WorkerSlot:
-    """A worker slot, which runs one task at a time: a number of threads, and the index of its GPU if it has one."""
+    """A worker slot, which runs one task at a time: a number of threads, and the index of its GPU, if it has one, among
+    those that this process sees."""
 
     threads: int
     gpu: int | None = None
 
     def environment(self, *, gpus: int = 0) -> Mapping[str, str]:
         """Environment variables of a task that uses ``gpus`` GPUs, 0 or 1."""
-        seen = str(self.gpu) if gpus and self.gpu is not None else ""
-        return thread_environment(self.threads) | {"CUDA_VISIBLE_DEVICES": seen}
+        variable, seen = "CUDA_VISIBLE_DEVICES", ""
+        if gpus and self.gpu is not None:
+            visible = os.environ.get(variable)
+            seen = str(self.gpu) if visible is None else visible.split(",")[self.gpu].strip()
+        return thread_environment(self.threads) | {variable: seen}
 
 
 def thread_environment(threads: int) -> dict[str, str]:
