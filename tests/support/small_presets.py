@@ -18,6 +18,7 @@ TINY_RIG = replace(
         seed_voxels=1,
         losses=RIG.initial.losses,
         perturbation=RIG.initial.perturbation,
+        depth_distortion=RIG.initial.depth_distortion,
         floaters=RIG.initial.floaters,
         random_background=False,
     ),

@@ -10,7 +10,11 @@ from structgstream.frames import MultiViewFrame
 from structgstream.scene.state import state_of
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
-from structgstream.training.frame0.regularizers import FreeSpaceConfig, in_free_space
+from structgstream.training.frame0.regularizers import (
+    DepthDistortionConfig,
+    FreeSpaceConfig,
+    in_free_space,
+)
 from structgstream.training.frame0.seeding import voxel_centers
 from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
@@ -86,6 +90,20 @@ def test_stages_of_a_fit_that_begins_late() -> None:
     config = replace(QUICK, coarse_iterations=50, medium_iterations=30)
     for done, counts in ((0, (50, 30)), (20, (30, 30)), (60, (0, 20)), (100, (0, 0))):
         assert config.stages(done=done) == [(counts[0], 0.5), (counts[1], 0.7)]
+
+
+def test_solid_surfaces() -> None:
+    world = moving_world(1)
+    config = replace(
+        QUICK,
+        depth_distortion=DepthDistortionConfig(weight=0.05),
+    )
+    result = fit(world, config=config)
+    assert result.train_psnr > 15.0
+    assert result.losses["depth_distortion"] > 0.0
+    assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
+        result.grown - result.removed
+    )
 
 
 def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_changes() -> None:

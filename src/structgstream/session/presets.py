@@ -15,7 +15,7 @@ from structgstream.session.periods import PeriodConfig
 from structgstream.session.rate_control import RateConfig
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates
-from structgstream.training.frame0.regularizers import FreeSpaceConfig, PerturbationConfig
+from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import (
     ExposureConfig,
@@ -331,6 +331,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45, offset_distance=0.0),
         perturbation=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
+        depth_distortion=DepthDistortionConfig(weight=0.05),
         floaters=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,

@@ -149,13 +149,15 @@ class SceneLoss(ViewLoss):
 
     Args:
         structured: the Gaussians of its anchors.
+        unperturbed: all its Gaussians before perturbation.
     """
 
     structured: StructuredGaussians
+    unperturbed: Gaussians
 
     def detached(self) -> Self:
         structured = replace(self.structured, gaussians=self.structured.gaussians.detached())
-        return replace(super().detached(), structured=structured)
+        return replace(super().detached(), structured=structured, unperturbed=self.unperturbed.detached())
 
 
 def picture_loss(
@@ -221,9 +223,8 @@ def view_loss(
     with watch.stage("generate"):
         tiles = None if active is None else active.tiles
         structured = scene.structured(view.camera, backend, tiles=tiles)
-        gaussians = scene.with_free_gaussians(structured)
-        if perturbation is not None:
-            gaussians = perturbation(gaussians)
+        unperturbed = scene.with_free_gaussians(structured)
+        gaussians = unperturbed if perturbation is None else perturbation(unperturbed)
     loss = picture_loss(
         gaussians,
         view,
@@ -240,7 +241,7 @@ def view_loss(
             scales, opacities = gaussians.scales, gaussians.opacities
             value = volume(scales, opacities, reduction=weights.volume_reduction, backend=backend)
             loss = with_term(loss, "volume", value, weight=weights.volume)
-    return SceneLoss(**vars(loss), structured=structured)
+    return SceneLoss(**vars(loss), structured=structured, unperturbed=unperturbed)
 
 
 class GradientStatistics:

@@ -17,9 +17,11 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.frame0.densify import Densifier, GrowthConfig
 from structgstream.training.frame0.regularizers import (
+    DepthDistortionConfig,
     FreeSpaceConfig,
     PerturbationConfig,
     RandomNumbers,
+    depth_distortion,
     in_free_space,
     perturbation_at,
 )
@@ -89,6 +91,7 @@ class InitialConfig:
     """Train through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was trained]), also
     on reduced pictures (paper: no, 0.3 square pixels of each picture)."""
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    depth_distortion: DepthDistortionConfig = field(default_factory=DepthDistortionConfig)
     floaters: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     losses: InitialLossWeights = InitialLossWeights()
     rates: InitialRates = field(default_factory=InitialRates)
@@ -172,6 +175,12 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                     scene.anchors, voxel_size=config.voxel_size, weights=config.losses, backend=self.backend
                 )
                 loss = with_term(loss, "offset_distance", distance, weight=config.losses.offset_distance)
+        if weight := config.depth_distortion.weight_at(iteration, config.iterations):
+            with self.watch.stage("rasterise"):
+                spread = depth_distortion(
+                    loss.unperturbed, sample.camera, scale=config.depth_distortion.SCALE, backend=self.backend
+                )
+                loss = with_term(loss, "depth_distortion", spread, weight=weight)
         if roving:
             self.roving.fit_gains(sample, loss.rendering, share=iteration / config.iterations)
         else:
