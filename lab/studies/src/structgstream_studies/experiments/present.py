@@ -18,8 +18,12 @@ from structgstream_studies.experiments.readings import READINGS
 from structgstream_studies.experiments.results import Result, round_floats
 from structgstream_studies.experiments.variants import FULL_METHODS, variants
 
-SETTLED: Mapping[str, Any] = {"initial.losses.offset_distance_reading": "scaled"}
-"""Fields that are gone, with the value that every present program has: a result with it has today's configuration."""
+SETTLED: Mapping[str, Any] = {
+    "initial.losses.offset_distance_reading": "scaled",
+    "initial.depth_distortion.weight": 0.0,
+    "depth_distortion.weight": 0.0,
+}
+"""Fields that some programs lack, with the value at which the others do the same: it makes no difference."""
 
 
 @dataclass(frozen=True)
