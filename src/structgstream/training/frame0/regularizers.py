@@ -125,7 +125,7 @@ def perturbation_at(
 
 
 COVERED = 0.5
-"""Rays with less coverage are not counted."""
+"""Pixels with less coverage show no surface: their depth is not counted, and nothing is in front of one there."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,6 @@ def depth_distortion(gaussians: Gaussians, camera: Camera, *, scale: float, back
     variance = (second / divisor - mean.square()).clamp(min=0.0)
     spread = (variance + 1e-8).sqrt() / mean
     return (spread * covered).sum() / covered.sum().clamp(min=1)
-
-
-COVERED = 0.5
-"""Pixels with less coverage show no surface, so nothing is in front of one there."""
 
 
 @dataclass(frozen=True)
