@@ -17,6 +17,7 @@ from structgstream.codec.container.records import (
     CHECKSUM,
     FRAME,
     INDEX_ENTRY,
+    LAYER_TYPES,
     PACKET_KINDS,
     PREFIX,
     RECORD,
@@ -248,13 +249,12 @@ class Packets(Sequence[PacketInfo]):
                 raise self.damaged(index) from error
             raise
         field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
-        sound = read_head(self._data, offset + head.bytes)
-        if sound is None or sound.type != RecordType.SOUND:
-            return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
-        size = head.bytes + sound.bytes
-        return PacketInfo(
-            PACKET_KINDS[head.type], index, pts_seconds, offset, size, field_bytes | {"sound": sound.bytes}
-        )
+        size = head.bytes
+        if (sound := self._sound_head(offset + head.bytes)) is not None:
+            at, sound_head = sound
+            size = at + sound_head.bytes - offset
+            field_bytes["sound"] = sound_head.bytes
+        return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, size, field_bytes)
 
     def packet(self, index: int) -> Packet:
         """The packet of a frame that is not lost; its checksum is verified."""
@@ -269,11 +269,20 @@ class Packets(Sequence[PacketInfo]):
     def sound(self, index: int) -> FrameSound | None:
         """The sound that is stored with a frame that is not lost; None if there is none, or it is damaged."""
         head = read_head(self._data, self.offsets[index])
-        record = None if head is None else read_record(self._data, self.offsets[index] + head.bytes)
-        if record is None or record.type != RecordType.SOUND:
+        found = None if head is None else self._sound_head(self.offsets[index] + head.bytes)
+        record = None if found is None else read_record(self._data, found[0])
+        if record is None:
             return None
         sound = unpack_sound(record.payload)
         return sound if sound.index == index else None
+
+    def _sound_head(self, end: int) -> tuple[int, Head] | None:
+        """Offset and head of the sound record of the packet that ends at byte ``end``, behind its layers."""
+        head = read_head(self._data, end)
+        while head is not None and head.type in LAYER_TYPES:
+            end += head.bytes
+            head = read_head(self._data, end)
+        return None if head is None or head.type != RecordType.SOUND else (end, head)
 
     def damaged(self, index: int) -> StreamError:
         """The error for a packet that was damaged after opening."""
