@@ -14,6 +14,7 @@ from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments
+from structgstream.errors import StreamError
 from tests.support.period_streams import FIRSTS, FRAMES, period_of, period_packets, period_stream
 from tests.support.segment_streams import Hands, Killed, KilledStore, folder
 from tests.support.streams import same
@@ -105,6 +106,18 @@ def test_an_init_record_is_named_before_its_first_frame_is_written(tmp_path: Pat
         assert (len(reader), len(reader.periods)) == (4, 1)
     sink.close()
     assert [one.period for one in read_manifest(store).periods] == [0]
+
+
+def test_what_is_in_its_time_of_grace_stops_no_reader_and_no_writer(tmp_path: Path) -> None:
+    """Segments of a period whose init record is not named any more are still in the folder, and count as gone."""
+    options, store = SegmentsOptions(window_seconds=0.5 / 30.0, grace_seconds=120.0), folder(tmp_path / "out")
+    for stop in range(1, FRAMES + 1):
+        write(store, stop=stop, options=options)
+        with open_stream(store.folder) as reader:
+            assert same(reader.scene(stop - 1), period_stream(codec="raw")[1][stop - 1])
+    assert [one.period for one in read_manifest(store).periods] == [2]
+    with pytest.raises(StreamError, match="have left its window"):
+        write_archive(store, tmp_path / "out.sgs")
 
 
 @pytest.mark.parametrize("stops", [(), (4, 5, 9, 10)])

@@ -237,8 +237,10 @@ class StoredBytes:
         self.sizes += sizes
         self.kinds += kinds
         self.seconds += seconds
-        if entry.file not in there:
-            if not isinstance(entry, SegmentEntry) or entry.segment >= manifest.window.first_segment:
+        left = isinstance(entry, SegmentEntry) and entry.segment < manifest.window.first_segment
+        # In its time of grace a segment is there, though the manifest no longer names its period's init record.
+        if entry.file not in there or (left and entry.period not in self._periods):
+            if not left:
                 raise StreamError(f"{self._store.name} has no {entry.file}, which its manifest names.")
             last = self.gone.pop() if self.gone and self.gone[-1].stop == first else range(first, first)
             self.gone.append(range(last.start, first + len(sizes)))

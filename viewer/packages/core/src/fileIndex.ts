@@ -1,11 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Index and footer: positions of the packets in a stored file, without reading them (docs/bitstream.md). */
 
-import { RecordType, recordIn, viewOf } from "./records.js";
+import { HEAD_BYTES, RecordType, recordIn, viewOf } from "./records.js";
 
 export const FOOTER_BYTES = 16;
 const ENTRY_BYTES = 13;
 const FOOTER_MAGIC = "SGSINDEX";
+
+/** Bytes at the start of a packet's record that {@link packetSeconds} reads. */
+export const TIMED_BYTES = HEAD_BYTES + 12;
+
+/** The presentation time in the first bytes of a packet's record, unverified. */
+export function packetSeconds(bytes: Uint8Array): number {
+  return viewOf(bytes).getFloat64(HEAD_BYTES + 4, true);
+}
 
 /** Position of one packet, or of the init record before packet `index`. */
 export interface IndexEntry {

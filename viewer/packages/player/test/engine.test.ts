@@ -28,7 +28,7 @@ test("the clip has groups", () => {
   expect(KEYS).toEqual([0, 3, 6, 9]);
 });
 
-test("the first picture takes head, tail, header and one key packet", async () => {
+test("the first picture takes head, tail, the last packet's time, header and one key packet", async () => {
   const file = new ServedFile(CLIP);
   const play = playingFile(file);
   await play.until(() => play.shown.length > 0);
@@ -37,6 +37,7 @@ test("the first picture takes head, tail, header and one key packet", async () =
   expect(file.requests).toEqual([
     [0, 4096],
     [CLIP.length - 4096, CLIP.length],
+    [PACKETS.at(-1)!.offset, PACKETS.at(-1)!.offset + 20],
     [4096, key.offset + key.bytes],
   ]);
   expect(play.engine.frames.duration).toBeCloseTo(12 / 30);
@@ -48,7 +49,7 @@ test("opened elsewhere, the packets from the key on are read, and no others", as
   const play = playingFile(file, PACKETS[8]!.ptsSeconds);
   await play.until(() => play.shown.at(-1) === 8);
   expect(play.shown).toEqual([6, 8]);
-  expect(file.requests.slice(2)).toEqual([
+  expect(file.requests.slice(3)).toEqual([
     [4096, PACKETS[0]!.offset],
     [PACKETS[6]!.offset, PACKETS[9]!.offset],
   ]);
@@ -333,6 +334,22 @@ describe("a growing file", () => {
     await play.until(() => play.errors.length > 0);
     expect(play.errors[0]).toContain("it was replaced. Load it again");
   });
+});
+
+test("frames that a live run skipped take their time, also in a file with an index", async () => {
+  const { record } = await import("../../core/test/streams.ts");
+  const bytes = CLIP.slice();
+  for (const { index, isKey, offset, bytes: size } of PACKETS) {
+    const payload = bytes.slice(offset + 8, offset + size - 4);
+    new DataView(payload.buffer).setFloat64(4, 3 * index, true);
+    bytes.set(record(isKey ? 2 : 3, payload), offset);
+  }
+  const play = playingFile(new ServedFile(bytes));
+  await play.until(() => play.engine.frames.count === 12, "all frames");
+  expect(play.engine.frames.duration).toBeGreaterThan(33);
+  play.engine.seek(20);
+  await play.until(() => play.shown.at(-1) === 6, "frame 6");
+  expect(play.errors).toEqual([]);
 });
 
 describe("damage", () => {

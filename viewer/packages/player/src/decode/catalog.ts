@@ -22,8 +22,6 @@ export abstract class Catalog {
   /** Position of a frame's packet, if known. */
   abstract place(index: number): Place | undefined;
   abstract isKey(index: number): boolean;
-  /** Sets the time of a frame from its packet. */
-  abstract learn(index: number, ptsSeconds: number): void;
   /** The first packet that a frame needs. */
   abstract groupStart(index: number): number;
   /** The frame after the last one that needs this frame's packet. */

@@ -10,7 +10,7 @@ interface Entry {
   readonly offset: number;
   /** Start of the next known record; records of unknown types may precede it. */
   end: number;
-  ptsSeconds: number | undefined;
+  readonly ptsSeconds: number;
 }
 
 /** Position of an init record after the first one, and the first frame of its period. */
@@ -26,7 +26,7 @@ export class FileCatalog extends Catalog {
   private readonly entries: (Entry | undefined)[] = [];
 
   /**
-   * @param fps frames per second, for times that are not known yet
+   * @param fps frames per second, for times of indexed and of lost frames
    * @param independent whether packets are independent of each other: codec `raw`
    */
   constructor(
@@ -40,12 +40,12 @@ export class FileCatalog extends Catalog {
     return this.entries.length;
   }
 
-  /** Adds all entries of an index; `end` is the offset of the index record. */
+  /** Adds all entries of an index, of evenly spaced frames; `end` is the offset of the index record. */
   fill(index: readonly IndexEntry[], end: number): void {
     for (const [i, { isKey, isInit, index: first, offset }] of index.entries()) {
       const next = index[i + 1]?.offset ?? end;
       if (isInit) this.inits.push({ first, start: offset, end: next });
-      else this.entries.push({ isKey, offset, end: next, ptsSeconds: undefined });
+      else this.entries.push({ isKey, offset, end: next, ptsSeconds: first / this.fps });
     }
     this.complete = true;
   }
@@ -89,11 +89,6 @@ export class FileCatalog extends Catalog {
 
   isKey(index: number): boolean {
     return this.entries[index]?.isKey === true;
-  }
-
-  learn(index: number, ptsSeconds: number): void {
-    const entry = this.entries[index];
-    if (entry) entry.ptsSeconds = ptsSeconds;
   }
 
   groupStart(index: number): number {

@@ -151,8 +151,7 @@ export class FileStream implements Stream {
         // Otherwise it is fetched when needed.
         if (header && this.begun <= this.current + 1) this.chapters.put(this.begun, header);
       }
-      if (indexed) catalog.learn(info.index, info.ptsSeconds);
-      else catalog.append(info);
+      if (!indexed) catalog.append(info);
       if (!indexed && info.index > before) events.lost(before, info.index, "the record there is damaged");
       store.put(reader.take(info.index), keepFrom);
     }

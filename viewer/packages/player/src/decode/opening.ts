@@ -2,8 +2,9 @@
 /**
  * Opens a stream: reads its header and the positions of its packets.
  *
- * Of a stored file only the first bytes, the index at its end and the rest of the init record are read. Without an index,
- * or without range requests, the whole file is read from its start, and packets are found as they arrive.
+ * Of a stored file only the first bytes, the index at its end, the time of the last packet and the rest of the init record
+ * are read. Without an index, without range requests, or if frames are not evenly spaced (a live run that skipped some),
+ * which an index does not tell, the whole file is read from its start, and packets are found as they arrive.
  */
 
 import {
@@ -11,8 +12,10 @@ import {
   type IndexEntry,
   indexEntries,
   indexOffset,
+  packetSeconds,
   type StreamHeader,
   StreamReader,
+  TIMED_BYTES,
 } from "@structgstream/core";
 import { joined } from "../source/joined.js";
 import type { ByteClient, ReadingEvents } from "./byteClient.js";
@@ -39,7 +42,7 @@ export class Opening {
   private ranged = true;
   private fileBytes: number | undefined;
   private loaded = 0;
-  private index: { entries: IndexEntry[]; end: number } | undefined;
+  private index: { entries: IndexEntry[]; end: number; lastSeconds: number } | undefined;
   /** Decides between the index and a scan. */
   private lookedForIndex = false;
   private announced = false;
@@ -97,16 +100,29 @@ export class Opening {
   }
 
   private useIndex(entries: IndexEntry[] | undefined, offset: number): void {
-    const first = entries?.[0];
-    if (!entries || !first) {
+    const [first, last] = [entries?.[0], entries?.at(-1)];
+    if (!entries || !first || !last) {
       this.scan();
       return;
     }
-    this.index = { entries, end: offset };
-    this.lookedForIndex = true;
-    const end = this.fromStart ? (entries[1]?.offset ?? offset) : first.offset;
-    if (this.loaded >= end) this.headerByIndex(end);
-    else this.read(this.loaded, end, false, () => this.headerByIndex(end));
+    const parts: Uint8Array[] = [];
+    const useTime = () => {
+      const start = joined(parts);
+      if (start.length < TIMED_BYTES) {
+        this.scan();
+        return;
+      }
+      this.index = { entries, end: offset, lastSeconds: packetSeconds(start) };
+      this.lookedForIndex = true;
+      const end = this.fromStart ? (entries[1]?.offset ?? offset) : first.offset;
+      if (this.loaded >= end) this.headerByIndex(end);
+      else this.read(this.loaded, end, false, () => this.headerByIndex(end));
+    };
+    this.client.read(last.offset, last.offset + TIMED_BYTES, false, {
+      bytes: (bytes) => parts.push(bytes),
+      end: useTime,
+      ...this.troubles,
+    });
   }
 
   /** Called when all bytes up to `end` were read; with a damaged index the header may be missing. */
@@ -157,9 +173,21 @@ export class Opening {
   private announceIfThere(): void {
     const { header } = this.reader;
     if (this.announced || !header || !this.lookedForIndex) return;
+    if (this.index && !this.isEvenlySpaced(header.fps)) {
+      this.index = undefined;
+      this.stop();
+      this.scan();
+      return;
+    }
     this.announced = true;
     this.events.header(header, this.ranged, this.index);
     this.events.read(this.reader, false);
+  }
+
+  /** Whether the last frame has the time that its number states, so that all times follow from numbers. */
+  private isEvenlySpaced(fps: number): boolean {
+    const { entries, lastSeconds } = this.index!;
+    return Math.abs(lastSeconds * fps - entries.at(-1)!.index) < 0.5;
   }
 
   private guarded(action: () => void): void {

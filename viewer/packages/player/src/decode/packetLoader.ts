@@ -190,7 +190,6 @@ export class PacketLoader {
       if (!isThere && !cannotCome && !ended) return at;
       const packet = isThere && !cannotCome ? packetIn(queue.peek(bytes), start) : undefined;
       if (packet?.index === run.next && packet.isKey === place.isKey) {
-        this.catalog.learn(packet.index, packet.ptsSeconds);
         const all = Math.min(queue.length, end - start);
         const sound = soundIn(queue.peek(all).subarray(bytes), start + bytes);
         this.store.put(packet, this.first);
@@ -207,10 +206,12 @@ export class PacketLoader {
   }
 }
 
-/** The sound in the record at the start of `bytes`, with a copy of its payload; undefined if there is none. */
+/** The sound in the records of `bytes`, behind layers, with a copy of its payload; undefined if there is none. */
 function soundIn(bytes: Uint8Array, offset: number): FrameSound | undefined {
-  if (bytes.length < HEAD_BYTES || bytes[0] !== RecordType.sound) return undefined;
-  const record = recordIn(bytes.subarray(0, recordBytes(bytes)), offset);
+  let at = 0;
+  while (bytes.length >= at + HEAD_BYTES && bytes[at] !== RecordType.sound) at += recordBytes(bytes.subarray(at));
+  if (bytes.length < at + HEAD_BYTES) return undefined;
+  const record = recordIn(bytes.subarray(at, at + recordBytes(bytes.subarray(at))), offset + at);
   return record && soundOf(record.payload.slice());
 }
 

@@ -84,9 +84,6 @@ export class SegmentCatalog extends Catalog {
     return part ? part.kind === "key" : this.segment(index)?.segment.first_frame === index;
   }
 
-  /** Times are those that the manifest states. */
-  learn(): void {}
-
   groupStart(index: number): number {
     const parts = this.manifest?.parts ?? [];
     if (this.part(index)) {

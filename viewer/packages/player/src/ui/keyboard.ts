@@ -87,10 +87,9 @@ export class Keyboard {
   private time(event: KeyboardEvent): boolean {
     const { player } = this;
     const { engine } = player;
-    const faster = (by: number) => {
-      const at = RATES.findIndex((rate) => rate >= player.playbackRate);
-      player.playbackRate = RATES[Math.min(Math.max(at + by, 0), RATES.length - 1)]!;
-    };
+    const { playbackRate } = player;
+    const slower = RATES.filter((rate) => rate < playbackRate).at(-1);
+    const faster = RATES.find((rate) => rate > playbackRate);
     const act: Readonly<Record<string, () => void>> = {
       " ": () => player.toggle(),
       k: () => player.toggle(),
@@ -100,8 +99,12 @@ export class Keyboard {
       ".": () => engine?.step(1),
       Home: () => engine?.seekFrame(0),
       End: () => player.goToNewest(),
-      "<": () => faster(-1),
-      ">": () => faster(1),
+      "<": () => {
+        player.playbackRate = slower ?? playbackRate;
+      },
+      ">": () => {
+        player.playbackRate = faster ?? playbackRate;
+      },
       l: () => player.setLoop(!player.loop),
       m: () => player.toggleSound(),
     };
