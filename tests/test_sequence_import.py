@@ -100,6 +100,29 @@ def test_a_budget_leaves_the_most_important(tmp_path: Path) -> None:
     check(tmp_path / "out.sgs", [part.select(rows) for part in parts])
 
 
+@pytest.mark.parametrize("linked", [True, False])
+def test_what_is_too_far_away_is_left_out_and_flat_gaussians_stay(linked: bool, tmp_path: Path) -> None:
+    part = some(80)
+    part.means[3], part.scales[5] = torch.tensor([1e7, 0.0, 0.0]), torch.tensor([1e-45, 0.1, 0.1])
+    found = imported(tmp_path, [part, part if linked else part.select(torch.arange(79))])
+    assert (found.linked, found.far) == (linked, 1)
+    assert found.counts == ((79, 79) if linked else (78, 79))
+    kept = part.select(torch.tensor([i for i in range(40) if i not in (3, 5)]))
+    with open_stream(tmp_path / "out.sgs") as reader:
+        means = reader.header.similarity.inverse_points(reader.scene(1).free.means.double()).float()
+        assert torch.cdist(kept.means, means).amin(1).max() < 0.01
+
+
+def test_a_file_that_cannot_be_read_leaves_the_former_stream(tmp_path: Path) -> None:
+    imported(tmp_path, moving(2))
+    before, files = (tmp_path / "out.sgs").read_bytes(), write(tmp_path, moving(3))
+    files[2].write_bytes(files[2].read_bytes()[:-8])
+    with pytest.raises(CaptureError):
+        import_sequence(files, tmp_path / "out.sgs", fps=2.0, backend=quickest_backend(), rig=RIG)
+    assert (tmp_path / "out.sgs").read_bytes() == before
+    assert not (tmp_path / "out.sgs.partial").exists()
+
+
 def test_files_that_make_no_stream(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="of different degrees"):
         imported(tmp_path, [some(5), some(5, degree=1)])

@@ -141,6 +141,21 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
         sync_folder(path.parent)
 
 
+@contextmanager
+def named_when_whole(path: Path) -> Iterator[Path]:
+    """The partial file to which the block writes what gets the name ``path`` at its end, unless it raises.
+
+    For writers that open and lock their file themselves. Raises StorageError if the file cannot be renamed.
+    """
+    partial = partial_path(path)
+    try:
+        yield partial
+        with _as_storage_error(path, ""):
+            give_name(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
 def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
     """Opens the file ``partial`` of ``of``, created if it is missing, exclusively for writing, at its beginning and
     without truncation. Raises StorageError if another process writes it, OSError if it cannot be opened."""

@@ -19,9 +19,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from structgstream.atomic_files import named_when_whole
 from structgstream.cameras import Camera, CameraRig, normalizing_similarity
 from structgstream.codec.fields.packet_fields import MAX_FREE
-from structgstream.codec.fields.quantization import float32
+from structgstream.codec.fields.quantization import LARGEST, float32
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder
@@ -46,6 +47,8 @@ DYNAMIC: frozenset[FieldName] = frozenset({"free", "free_births"})
 POSITION_PIXELS = 0.125
 """Step of positions, in pixels of a camera at the median Gaussian."""
 STEPS = {"free_log_scales": 1 / 32, "free_quats": 1 / 128, "free_logit_opacities": 1 / 16, "free_colors": 1 / 256}
+MIN_SCALE = 1e-12
+"""Least standard deviation along an axis; files have flat Gaussians of 0."""
 KEY_INTERVAL_SECONDS = 1.0
 MAX_LINKED_SHARE = 0.1
 """Rows are the same Gaussians if the median one moves by less than this share of the distance to any other."""
@@ -60,6 +63,7 @@ class ImportedSequence:
 
     frames: int  # number of frames
     counts: tuple[int, int]  # fewest and most Gaussians of a frame
+    far: int  # most Gaussians of a frame that are left out since they are too far away to be coded
     linked: bool  # whether Gaussians live on from frame to frame; else each frame is stored by itself
     degree: int  # degree of the spherical harmonics of the files
     color_psnr: float  # PSNR, dB, of pictures of frame 0 with one colour for each Gaussian, against the files
@@ -106,13 +110,16 @@ def import_sequence(
 
     def in_scene(gaussians: BakedGaussians) -> BakedGaussians:
         means = similarity.points(gaussians.means.double()).float()
-        return replace(gaussians, means=means, scales=gaussians.scales * similarity.scale)
+        scales = (gaussians.scales * similarity.scale).clamp(min=MIN_SCALE)
+        return replace(gaussians, means=means, scales=scales)
 
     first = in_scene(first)
     linked = len({header.count for header in headers}) == 1 and (
         len(files) == 1 or same_rows(first.means, in_scene(read_ply(files[1])).means)
     )
-    chosen = _chosen(first, max_splats)
+    position_step = _position_step(sampling.intervals(first.means))
+    reach = 0.999 * LARGEST * position_step
+    chosen = _chosen(first, max_splats, reach)
     header = StreamHeader(
         rig=rig,
         similarity=similarity,
@@ -123,23 +130,26 @@ def import_sequence(
         distance_input=False,
         config={"key_interval_seconds": KEY_INTERVAL_SECONDS},
         metadata={"capture": files[0].parent.name, "imported": "ply"},
-        steps={"free_means": _position_step(sampling.intervals(first.means)), **STEPS},
+        steps={"free_means": position_step, **STEPS},
         init_steps={name: 1.0 for name in state_of(_empty_scene(rig)) if name not in UNCODED_FIELDS},
     )
     encoder, key_interval = SceneEncoder(header), max(1, round(fps * KEY_INTERVAL_SECONDS)) if linked else 1
     psnr = color_psnr = math.inf
     quats = first.quats[chosen]
-    with closing(FileSink(output, overwrite=True)) as sink:
+    counts, far = [], []
+    with named_when_whole(output) as part, closing(FileSink(part, overwrite=True)) as sink:
         sink.open(header)
         for index, file in enumerate(files):
             whole = first if index == 0 else in_scene(read_ply(file))
-            gaussians = whole.select(chosen if linked else _chosen(whole, max_splats))
+            gaussians = whole.select(chosen if linked else _chosen(whole, max_splats, reach))
+            counts.append(len(gaussians))
+            far.append(int((whole.means.abs().amax(1) > reach).sum()))
             if linked:  # a quaternion and its negative are the same rotation
                 same_side = torch.where((gaussians.quats * quats).sum(1, keepdim=True) < 0, -1.0, 1.0)
                 quats = gaussians.quats * same_side
                 gaussians = replace(gaussians, quats=quats)
             births = torch.arange(len(gaussians)) + (0 if linked else index << _FRAME_BITS)
-            scene = replace(_empty_scene(rig), free=_free(gaussians, cameras, births), sampling=sampling)
+            scene = replace(_empty_scene(rig), free=_free(gaussians, cameras, births, reach), sampling=sampling)
             kind = PacketKind.DELTA if index % key_interval else PacketKind.KEY
             encoded = encoder.encode(scene, index=index, pts_seconds=index / fps, kind=kind)
             sink.write(encoded.packet)
@@ -148,8 +158,7 @@ def import_sequence(
                 color_psnr = pictures_psnr(whole, scene, cameras, backend)
                 psnr = pictures_psnr(whole, decoded, cameras, backend)
             on_frame()
-    counts = [min(header.count, max_splats) for header in headers]
-    return ImportedSequence(len(files), (min(counts), max(counts)), linked, first.degree, color_psnr, psnr)
+    return ImportedSequence(len(files), (min(counts), max(counts)), max(far), linked, first.degree, color_psnr, psnr)
 
 
 def same_rows(before: Tensor, after: Tensor) -> bool:
@@ -178,17 +187,18 @@ def ring_around(gaussians: BakedGaussians, down: tuple[float, float, float]) -> 
     return CameraRig(cameras)
 
 
-def _chosen(gaussians: BakedGaussians, max_splats: int) -> Tensor:
-    """Rows of the most important Gaussians, neighbours in space next to each other."""
-    rows = gaussians.by_importance()[:max_splats]
+def _chosen(gaussians: BakedGaussians, max_splats: int, reach: float) -> Tensor:
+    """Rows of the most important Gaussians within ``reach`` along each axis, neighbours in space next to each other."""
+    rows = gaussians.by_importance()
+    rows = rows[gaussians.means[rows].abs().amax(1) <= reach][:max_splats]
     return rows[morton_order(gaussians.means[rows])]
 
 
-def _free(gaussians: BakedGaussians, cameras: Sequence[Camera], births: Tensor) -> FreeGaussians:
+def _free(gaussians: BakedGaussians, cameras: Sequence[Camera], births: Tensor, reach: float) -> FreeGaussians:
     seen = [gaussians.colors(camera.center.to(gaussians.means)) for camera in cameras] if gaussians.degree else []
     colors = torch.stack(seen).mean(0) if seen else 0.5 + Y0 * gaussians.sh[:, 0]
     return FreeGaussians(
-        means=gaussians.means,
+        means=gaussians.means.clamp(-reach, reach),
         log_scales=gaussians.scales.log(),
         quats=gaussians.quats,
         logit_opacities=gaussians.opacities.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY).logit(),

@@ -234,6 +234,10 @@ def import_files(arguments: list[str]) -> None:
         f"Wrote {output}: {frames_text(found.frames)} of {count} Gaussians, {human_bytes(size_bytes)}, "
         f"{human_bytes(round(size_bytes / found.frames))} a frame",
     )
+    if found.far:
+        print_lines(
+            console, f"Left out: up to {found.far:,} Gaussians of a frame that are too far away for the stream's steps."
+        )
     print_lines(
         console,
         "All files have the same Gaussians; the stream contains their changes."
@@ -308,10 +312,9 @@ def add_sound(arguments: list[str]) -> None:
     output = options.output
     check_ending(output, ".sgs", command="add-sound")
     check_new(output, overwrite=options.overwrite)
-    from structgstream.atomic_files import give_name, partial_path
+    from structgstream.atomic_files import named_when_whole
     from structgstream.codec.reader import open_stream
     from structgstream.codec.sinks import FileSink
-    from structgstream.errors import StorageError
     from structgstream.evaluation.recording import capture_of
     from structgstream.preparation.sound import chosen_sound
     from structgstream.recorder import copy_with_sound
@@ -323,13 +326,6 @@ def add_sound(arguments: list[str]) -> None:
         sound = chosen_sound(source, options.capture, options.sound, offset_seconds=options.sound_offset)
         if sound is None:
             raise UsageError("--sound none adds nothing; name a camera or a file.")
-        part = partial_path(output)  # half a stream would look like a shorter one
-        try:
+        with named_when_whole(output) as part:  # half a stream would look like a shorter one
             copy_with_sound(reader, FileSink(part, overwrite=True), sound, name=str(options.stream))
-            try:
-                give_name(part, output)
-            except OSError as error:
-                raise StorageError(f"{output} cannot be written ({error.strerror}).") from None
-        finally:
-            part.unlink(missing_ok=True)
     print_lines(Console(), f"Wrote {output}: {frames_text(len(reader))}, sound of {sound.name}")
