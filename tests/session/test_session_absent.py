@@ -262,7 +262,7 @@ def test_a_scene_that_no_picture_shows_is_held_and_found_again(world: World, tmp
     motion = replace(CONFIG.online.motion, occluded_share=0.0)
     config = replace(CONFIG, online=replace(CONFIG.online, motion=motion))
     reports = run(source, whole, config=config)
-    assert [dict(report.counts).get("repeated", 0) for report in reports] == [0, 0, 1, 0]
+    assert [dict(report.counts).get("held", 0) for report in reports] == [0, 0, 1, 0]
     assert set(world.rig.training) <= set(reports[2].absent)
     assert reports[2].bytes < 100 < reports[3].bytes
     assert "the scene is held" in summary(reports[2], 4)

@@ -34,7 +34,7 @@ CONFIG = OnlineConfig(
     rates=varied(OnlineRates(), ANCHOR_POSITIONS=1e-3),
     motion=MOTION,
     scene_flow=SceneFlowConfig(enabled=True),
-    spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(picture_width=128)),
+    spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(longer_side=128)),
     patching=PatchingConfig(spawn="off", iteration=4),
 )
 START = GroupStartConfig(iterations=16, rounds=2, births=40)

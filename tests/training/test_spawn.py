@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from structgstream.cameras import Camera
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
@@ -60,10 +61,17 @@ def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
     assert not compared(spoiled(view), view, floor=floor, rules=RULES).missing_share.any()
 
 
-def test_pictures_are_looked_at_in_the_width_that_is_asked_for() -> None:
-    found = compared(VIEWS[0].colors, VIEWS[0], floor=None, rules=replace(RULES, picture_width=48))
-    assert (found.view.camera.width, found.view.camera.height) == (48, 32)
-    assert found.missing_share.shape == (32, 48)
+@pytest.mark.parametrize(("camera", "size"), [(VIEWS[0].camera, (48, 32)), (VIEWS[0].camera.resized(64, 96), (32, 48))])
+def test_pictures_are_compared_at_the_longer_side_that_is_asked_for(camera: Camera, size: tuple[int, int]) -> None:
+    view = View(0, camera, torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8))
+    found = compared(view.colors, view, floor=None, rules=replace(RULES, longer_side=48))
+    assert (found.view.camera.width, found.view.camera.height) == size
+    assert found.missing_share.shape == size[::-1]
+
+
+def test_a_nearer_near_plane_has_as_many_depths_for_a_pixel_of_disparity() -> None:
+    rules = SpawnRules()
+    assert [rules.planes_of(near) for near in (0.24, 0.12, 0.1200001, 0.06, 0.03, 1e-4)] == [48, 48, 48, 96, 192, 384]
 
 
 def test_without_anything_missing_nothing_is_spawned() -> None:

@@ -10,7 +10,7 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.groups import tracking
 from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _measure_view, track_frame
-from structgstream.training.online.config import LiftConfig, MotionConfig
+from structgstream.training.online.config import MotionConfig
 from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moving_world
 
@@ -24,7 +24,7 @@ def world(*, speed: float = SPEED, movers: int = 60) -> World:
 
 def tracker(scenery: World, config: TrackConfig = CONFIG, *, occluded_share: float = 0.0) -> Tracker:
     motion = MotionConfig(enabled=True, occluded_share=occluded_share)
-    return Tracker(config, motion, LiftConfig(), scenery.rig, quickest_backend())
+    return Tracker(config, motion, scenery.rig, quickest_backend())
 
 
 def tracked(

@@ -112,8 +112,8 @@ def change(came: int, went: int) -> str:
 def remarks(counts: Mapping[str, int]) -> str:
     """Remarks on a frame's pictures: outlier views and refused births (``training/online/select.py``)."""
     found = []
-    if counts.get("repeated"):
-        found.append("no pictures show anything: the scene is held")
+    if counts.get("held"):
+        found.append("fewer than two pictures show anything: the scene is held")
     if counts.get("views left out"):
         found.append(f"{counts['views left out']} views left out: only their pictures changed, or theirs did not")
     if counts.get("scene cuts"):

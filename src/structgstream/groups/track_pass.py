@@ -184,7 +184,7 @@ class Pass:
         """The state at ``start``, or at frame 0."""
         online, scene = base.config.online, on_device(base.scene(), backend.device)
         rig = base.header.similarity.rig(base.header.rig)
-        tracker = Tracker(config, online.motion, online.scene_flow.LIFT, rig, backend)
+        tracker = Tracker(config, online.motion, rig, backend)
         if start is None:
             return cls(scene, tracker, base.position_step, Tracked.at_rest(scene), 0)
         return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)

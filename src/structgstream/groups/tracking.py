@@ -21,7 +21,7 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
-from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
+from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
     VISIBLE_PIXELS,
     ViewChange,
@@ -41,7 +41,6 @@ from structgstream.training.views import View, area_mean, as_picture, blackened,
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
-FLOW = FlowConfig(apart=True, far=True)
 PRIOR = 0.7
 """Initial displacement of a primitive, as a share of its last displacement."""
 RENDERED_EVERY = 3
@@ -81,7 +80,6 @@ class Tracker:
 
     config: TrackConfig  # sizes and cameras
     motion: MotionConfig  # thresholds of the selection, for pictures of the stream
-    lift: LiftConfig  # configuration of the scene flow
     rig: CameraRig  # rig of the stream, in the units of the scene
     backend: Backend
 
@@ -106,7 +104,6 @@ class Tracker:
             config=replace(self.motion, picture_scale=self.config.picture_scale),
             backend=self.backend,
             flow_from=[view.index for view in taken],
-            flow=FLOW,
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -145,8 +142,8 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
         views = [entry.view for entry in seen]
         evidence = flow_evidence([entry.flows[primitives] for entry in seen])
         centers = primitive_centers(scene, _coverage(seen, scene))
-        priors, lift = PRIOR * past.velocities[primitives], tracker.lift
-        found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
+        priors = PRIOR * past.velocities[primitives]
+        found = lift_flow(evidence, centers[primitives], priors, views, backend=tracker.backend)
         velocities[primitives] = found.displacements
         if len(primitives):
             turn = pictures.index // tracker.stride(len(pictures.views))
@@ -157,7 +154,6 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
                 (centers + velocities)[primitives],
                 torch.zeros_like(priors),
                 [entry.view for entry in part],
-                config=lift,
                 backend=tracker.backend,
             )
             velocities[primitives] += again.displacements
@@ -236,7 +232,7 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     first, second, counted = on_processor(picture, view.image, counting)  # Where flow is searched.
-    found = flow_map(first, second, counted, size, mask=counted, config=FLOW, backend=backend)
+    found = flow_map(first, second, counted, size, mask=counted, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps.to(inside.device), inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)

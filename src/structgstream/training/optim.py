@@ -261,10 +261,10 @@ class MeanOfSteps:
 
 
 class LastPass:
-    """Mean loss terms and PSNR over the last pass through the views; tensors are read on access only.
+    """Mean loss terms and PSNR over the last visits of the views; tensors are read on access only.
 
     Args:
-        after: number of first iterations to ignore.
+        after: number of first iterations to ignore: all but one less than two passes, which hold a whole one.
         terms_after: the same for loss terms, where not every visit of a view has terms that can be compared.
     """
 

@@ -259,6 +259,8 @@ def fit_first_frame_again(
     generator = torch.Generator().manual_seed(seed)
     template = warm_start(scene, cell=config.voxel_size * config.seed_voxels)
     done = max(config.iterations - iterations, 0)
+    # The share that may be added beyond the bound is one of the seeds, not of each period's scene.
+    config = replace(config, growth=replace(config.growth, min_growth=0.0))
     return _fit(frame, rig, template, config=config, backend=backend, generator=generator, done=done, on_step=on_step)
 
 
@@ -283,7 +285,7 @@ def _fit(
     growth = config.growth.for_pictures(median(view.enlargement for view in views))
     densifier = Densifier.of(template, config=growth, iterations=config.iterations, voxel_size=config.voxel_size)
     walked = RovingViews.of(roving, first=len(rig.training), fits_gains=config.camera_color, device=backend.device)
-    last_pass = LastPass(config.iterations - len(views) * (2 if roving else 1))
+    last_pass = LastPass(config.iterations - 2 * len(views) * (2 if roving else 1) + 1)
     numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(
         config,

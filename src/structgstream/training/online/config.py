@@ -16,39 +16,6 @@ from structgstream.training.parameters import RoundingConfig
 
 
 @dataclass(frozen=True)
-class FlowConfig:
-    """How finely flow is searched (``flow.dis_search``)."""
-
-    finest_level: int = 1
-    """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
-    min_width: int = 240
-    """Pixels. If the finest level is narrower than this, the search goes on to a finer one: in small pictures what
-    moves is small, too."""
-    apart: bool = False
-    """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
-    from each other."""
-    far: bool = False
-    """Where flow is inconsistent, search again for motion by more than things are large (``flow.block_search``)."""
-
-    def __post_init__(self) -> None:
-        if self.finest_level < 0 or self.min_width < 0:
-            raise ConfigError(
-                f"The flow search has finest level {self.finest_level} and least width {self.min_width}; "
-                "expected neither below 0."
-            )
-
-    def level_of(self, width: int) -> int:
-        """The finest level for pictures ``width`` pixels wide."""
-        level = self.finest_level
-        while level > 0 and width >> level < self.min_width:
-            level -= 1
-        return level
-
-
-USUAL_FLOW = FlowConfig()
-
-
-@dataclass(frozen=True)
 class MotionConfig:
     """Thresholds of motion selection; not in the paper.
 
@@ -95,23 +62,6 @@ class MotionConfig:
 
 
 @dataclass(frozen=True)
-class LiftConfig:
-    """Robust fit of displacements to the flow of neighbouring primitives; not in the paper."""
-
-    neighbours: int = 12
-    """Number of nearest primitives, including itself, whose flow a displacement is fitted to."""
-    bandwidth: float = 0.7
-    """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
-    color_bandwidth: float = 0.15
-    """Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
-    adjacent objects. 0: no weight by colour."""
-    inlier_share: float = 0.4
-    """Least share of inliers of a valid displacement, over all flow and in each agreeing view."""
-    agreeing_views: int = 2
-    """Least number of agreeing views; otherwise a primitive takes the motion prior."""
-
-
-@dataclass(frozen=True)
 class SceneFlowConfig:
     """Initial displacement of primitives; not in the paper."""
 
@@ -123,18 +73,13 @@ class SceneFlowConfig:
     """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
     every second or third, in turn."""
 
-    FLOW: ClassVar[FlowConfig] = FlowConfig(apart=True, far=True)
-    """How flow is searched."""
-    LIFT: ClassVar[LiftConfig] = LiftConfig()
-    """How displacements are fitted to it."""
-
 
 @dataclass(frozen=True)
 class SpawnRules:
     """Thresholds of one sweep for missing content, by which free Gaussians are spawned and pruned."""
 
-    picture_width: int = 320
-    """Pictures are reduced to at most this width, pixels."""
+    longer_side: int = 320
+    """Pictures are reduced to at most this longer side, pixels."""
     residual_threshold: float = 0.10
     """Residual, 0 to 1, above which a pixel counts as wrong."""
     missing_threshold: float = 0.10
@@ -142,7 +87,7 @@ class SpawnRules:
     pixel_step: int = 2
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
-    """Number of depths of a ray."""
+    """Number of depths of a ray that begins ``NEAR`` in front of its camera; of a nearer one in proportion more."""
     min_supports: int = 2
     """Least number of other views that support a point: there a missing pixel lies at its projection."""
     max_contradictions: float = 0.34
@@ -166,6 +111,15 @@ class SpawnRules:
     outlier_views: int = 2
     """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
 
+    NEAR: ClassVar[float] = 0.12
+    """Rig radii."""
+    MAX_PLANES: ClassVar[int] = 384
+
+    def planes_of(self, near: float) -> int:
+        """Number of depths of the rays of a camera with its near plane at ``near`` rig radii. They are even in inverse
+        depth, so that their distance, in pixels of disparity, is the same for every near plane."""
+        return min(round(self.planes * max(1.0, self.NEAR / near)), self.MAX_PLANES)
+
 
 @dataclass(frozen=True)
 class ThinSpawnConfig:
@@ -184,7 +138,7 @@ class ThinSpawnConfig:
     lies in small clusters."""
 
     RULES: ClassVar[SpawnRules] = SpawnRules(
-        picture_width=480,
+        longer_side=480,
         missing_threshold=0.04,
         pixel_step=1,
         max_contradictions=0.5,

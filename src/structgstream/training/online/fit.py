@@ -139,8 +139,8 @@ def fit_next_frame(
 
 
 def held(scene: Scene) -> FitResult[Scene]:
-    """The result of a frame whose pictures show nothing: the scene as it was."""
-    return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"repeated": 1})
+    """The result of a frame of which too few pictures show anything: the scene as it was."""
+    return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"held": 1})
 
 
 def needs_older(config: OnlineConfig) -> bool:

@@ -8,8 +8,8 @@ As in the paper::
                            |                   ^
                            '-- view-space gradients by id
 
-With motion selection (``compact``) free Gaussians are spawned before (``spawn.py``); after half of the steps they are
-only pruned.
+With motion selection (``compact``) free Gaussians are spawned before (``spawn.py``); in the iterations they are only
+pruned, once.
 """
 
 import math
@@ -90,7 +90,7 @@ class FrameOptimizer:
             backend=self.backend,
             generator=self.generator,
         )
-        last_pass = LastPass(iterations - len(seen), terms_after=iterations - rests * len(seen))
+        last_pass = LastPass(iterations - 2 * len(seen) + 1, terms_after=iterations - rests * len(seen))
         average = MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None
         hooks = OnlineHooks(
             start=start,

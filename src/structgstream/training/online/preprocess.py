@@ -20,11 +20,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, enlargement
 from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search, same_color
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, on_processor
-from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
+from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.views import (
     View,
     area_mean,
@@ -42,6 +42,9 @@ CONTEXT_SHARE, MIN_CONTEXT_PIXELS = 1 / 40, 16
 but at least so many pixels (Note [Lengths of the flow search])."""
 MIN_SAVING = 0.8
 """Boxes around parts have to be together smaller than this share of the box around all."""
+MIN_SEARCH_PIXELS = 240
+"""Flow is searched up to half of the pictures' size, or, if the longer side of that has fewer pixels, up to their full
+size: in small pictures what moves is small, too."""
 CELLS, REACH_CELLS = 80, 12
 """The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
 of them: 15 per cent of it."""
@@ -122,7 +125,7 @@ def preprocess(
     if len(compared) < min(motion.MIN_VOTES, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, scene_flow)
-    changes = detect_changes(views, before, config=motion, backend=backend, flow_from=flow_from, flow=scene_flow.FLOW)
+    changes = detect_changes(views, before, config=motion, backend=backend, flow_from=flow_from)
     return FramePictures(views, changes)
 
 
@@ -141,7 +144,6 @@ def detect_changes(
     config: MotionConfig,
     backend: Backend,
     flow_from: Collection[int] = (),
-    flow: FlowConfig = USUAL_FLOW,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -154,7 +156,6 @@ def detect_changes(
         config: threshold of change, dilation, and size of the maps of flow (``View.evidence``).
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
-        flow: how it is searched.
     """
     earlier = {last.index: last for last in before}
 
@@ -162,7 +163,7 @@ def detect_changes(
         if alike[0].index not in earlier:
             return [None] * len(alike)
         last = [earlier[view.index] for view in alike]
-        return _detect_changes(alike, last, config=config, backend=backend, flow_from=flow_from, flow=flow)
+        return _detect_changes(alike, last, config=config, backend=backend, flow_from=flow_from)
 
     with torch.no_grad():
         return in_groups(
@@ -180,7 +181,6 @@ def _detect_changes(
     config: MotionConfig,
     backend: Backend,
     flow_from: Collection[int],
-    flow: FlowConfig,
 ) -> list[PictureChange]:
     """Of views of one size, with their earlier pictures."""
     masks, other_masks = stacked_masks(views), stacked_masks(before)
@@ -201,7 +201,7 @@ def _detect_changes(
     small, last = (evidence_views([some[row] for row in rows], config.picture_scale) for some in (views, before))
     size = (small[0].camera.height, small[0].camera.width)
     estimated = [
-        flow_map(first, second, where, size, mask=mask, config=flow, backend=backend)
+        flow_map(first, second, where, size, mask=mask, backend=backend)
         for first, second, where, mask in zip(*here, strict=True)
     ]
     maps = torch.stack([of_view.maps for of_view in estimated]).to(changed.device)
@@ -260,13 +260,12 @@ def flow_map(
     size: tuple[int, int],
     *,
     mask: Tensor | None = None,
-    config: FlowConfig,
     backend: Backend,
 ) -> FlowMaps:
     """Flow between two pictures of one camera.
 
-    The confidence is zero outside a box around ``changed``, or with ``config.apart`` outside boxes around its parts,
-    where these are small.
+    It is searched in a box for each part of ``changed``, or in one around all, and where it is inconsistent again for
+    motion by more than things are large (:func:`block_search`). Outside the boxes the confidence is zero.
 
     Args:
         first: ``[H, W, 3]`` uint8, on the processor.
@@ -274,7 +273,6 @@ def flow_map(
         changed: ``[H, W]`` bool, where the two differ, on the processor.
         size: h and w of the maps; flow is in pixels of the pictures.
         mask: ``[H, W]`` bool, pixels that may have confidence, on the processor; None for all.
-        config: of the search.
         backend: the compute back-end.
 
     Raises:
@@ -283,7 +281,9 @@ def flow_map(
     maps = torch.zeros(3, *changed.shape)
     far_pixels = recolored_pixels = 0
     where = changed.numpy()
-    longer, level = max(where.shape), config.level_of(where.shape[1])
+    longer = max(where.shape)
+    level = 1 if longer // 2 >= MIN_SEARCH_PIXELS else 0
+    absolute = ABSOLUTE * enlargement(*where.shape) ** 2
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
     radius = max(1, round(COLOR_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
@@ -300,13 +300,13 @@ def flow_map(
         recolored_pixels += int(where[box][~alike.numpy()].sum())
         counts = alike if mask is None else alike & mask[box]
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
-        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
+        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=absolute)
 
     cell = max(1, round(longer / CELLS))
-    for box in _boxes(where, context) if config.apart else _box(where, context):
+    for box in _boxes(where, context):
         earlier, later = _cut(first, box), _cut(second, box)
         maps[:, *box] = consistent(box, earlier, later, search(earlier, later), search(later, earlier))
-    far = _far_boxes(where, maps[0].numpy() > 0.0, cell) if config.far else []
+    far = _far_boxes(where, maps[0].numpy() > 0.0, cell)
     for box in far:
         earlier, later = _cut(first, box), _cut(second, box)
         flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)

@@ -19,7 +19,7 @@ from structgstream.kernels.values import Neighbors, ViewFlows, tile_pixels
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest
-from structgstream.training.online.config import LiftConfig, MotionConfig, SceneFlowConfig
+from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.measure import (
     FlowEvidence,
     flow_evidence,
@@ -39,6 +39,18 @@ from structgstream.training.views import (
     stacked_colors,
     stacked_masks,
 )
+
+NEIGHBOURS = 12
+"""Number of nearest primitives, including itself, to whose flow a displacement is fitted."""
+BANDWIDTH = 0.7
+"""Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
+COLOR_BANDWIDTH = 0.15
+"""Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
+adjacent objects."""
+INLIER_SHARE = 0.4
+"""Least share of inliers of a valid displacement, over all flow and in each agreeing view."""
+AGREEING_VIEWS = 2
+"""Least number of agreeing views; otherwise a primitive takes the motion prior."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,6 @@ def lift_flow(
     priors: Tensor,
     views: Sequence[View],
     *,
-    config: LiftConfig,
     backend: Backend,
 ) -> LiftedFlow:
     """A displacement for each of ``T`` primitives.
@@ -70,7 +81,6 @@ def lift_flow(
         centers: ``[T, 3]`` visible centres.
         priors: ``[T, 3]`` displacements expected without flow.
         views: in the evidence's order; flow is in their pixels.
-        config: of the fit.
         backend: the compute back-end.
 
     Raises:
@@ -80,13 +90,12 @@ def lift_flow(
     informed = informed.nonzero()[:, 0]
     if not len(informed):
         return LiftedFlow(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
-    near, distances = nearest(points, points[informed], config.neighbours)
+    near, distances = nearest(points, points[informed], NEIGHBOURS)
     neighbours, distances = informed[near].to(centers.device), distances.to(centers.device)
-    spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
+    spread = BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
-    if config.color_bandwidth > 0.0:
-        apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
-        affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
+    apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
+    affinities = affinities * torch.exp(-0.5 * apart / COLOR_BANDWIDTH**2)
     viewports = [view.camera.viewport(centers) for view in views]
     # The tolerance has a unit of one pixel at the reference size: errors of the flow of what hardly moves come from how
     # bodies bend, from occlusion and from blending, which are as large in space however many pixels show them.
@@ -99,8 +108,8 @@ def lift_flow(
         torch.stack([viewport.K for viewport in viewports]) * per_noise[..., None],
         centers.new_tensor([viewport.near for viewport in viewports]),
     )
-    found = backend.lift(centers, seen, Neighbors(neighbours, affinities), priors, share=config.inlier_share)
-    lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
+    found = backend.lift(centers, seen, Neighbors(neighbours, affinities), priors, share=INLIER_SHARE)
+    lifted = (found.inlier_share > INLIER_SHARE) & (found.agreeing_views >= AGREEING_VIEWS)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
     return LiftedFlow(displacements, lifted)
 
@@ -195,7 +204,7 @@ def apply_scene_flow(
     dynamic = selection.primitives
     evidence, centers = selection.evidence.select(dynamic), selection.centers[dynamic]
     views_with_flow = [view for view in views if view.index in selection.views_with_flow]
-    first = lift_flow(evidence, centers, priors, views_with_flow, config=config.LIFT, backend=backend)
+    first = lift_flow(evidence, centers, priors, views_with_flow, backend=backend)
     fast = _is_fast(evidence, views_with_flow)
 
     moved = split.displaced(first.displacements)
@@ -203,7 +212,7 @@ def apply_scene_flow(
     displacements, corrected = first.displacements, torch.zeros_like(first.lifted)
     if config.rounds > 1:
         second = residual_flow(
-            moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, config=config, backend=backend
+            moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, backend=backend
         )
         displacements, corrected = displacements + second.displacements, second.lifted
     masks = {"lifted": first.lifted, "corrected": corrected, "fast": fast, "fast_lifted": fast & first.lifted}
@@ -234,7 +243,6 @@ def residual_flow(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     scale: float,
-    config: SceneFlowConfig,
     backend: Backend,
 ) -> LiftedFlow:
     """Remaining displacements of the primitives of ``dynamic``, from the flow of its rendering to the pictures.
@@ -244,7 +252,6 @@ def residual_flow(
         views: in which flow is estimated.
         active_tiles: by view index, with up-to-date renderings; views without one are skipped.
         scale: of the pictures on which flow is summed by blending weights.
-        config: of the scene flow.
         backend: the compute back-end.
     """
     seen = [view for view in views if view.index in active_tiles]
@@ -255,13 +262,13 @@ def residual_flow(
     with torch.no_grad():
         found = by_size(
             seen,
-            lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, config=config, backend=backend),
+            lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, backend=backend),
         )
     evidence = flow_evidence([primitive_sums(of_view, folded) for of_view in found])
     coverage = found[0][:, 3]
     for of_view in found[1:]:
         coverage = coverage + of_view[:, 3]
-    return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, config=config.LIFT, backend=backend)
+    return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, backend=backend)
 
 
 def _weigh_residual_flow(
@@ -270,7 +277,6 @@ def _weigh_residual_flow(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     scale: float,
-    config: SceneFlowConfig,
     backend: Backend,
 ) -> Tensor:
     """The maps of :func:`flow_evidence` for views of one size, summed by id: ``[V, slots, 7]``."""
@@ -285,7 +291,7 @@ def _weigh_residual_flow(
     size = (cameras[0].height, cameras[0].width)
 
     def flow_of(drawn: Tensor, picture: Tensor, changed: Tensor, mask: Tensor | None = None) -> Tensor:
-        return flow_map(drawn, picture, changed, size, mask=mask, config=config.FLOW, backend=backend).maps
+        return flow_map(drawn, picture, changed, size, mask=mask, backend=backend).maps
 
     threads = torch.get_num_threads()
     with ThreadPoolExecutor(threads) as pool:

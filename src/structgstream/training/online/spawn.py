@@ -105,7 +105,7 @@ def spawn_by_sweep(
             index,
             torch.stack([columns, rows], -1),
             farthest,
-            planes=rules.planes,
+            planes=rules.planes_of(view.near),
             min_supports=rules.min_supports,
             max_contradictions=rules.max_contradictions,
         )
@@ -217,8 +217,8 @@ def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:
 
 MIN_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
-DEPTH_WIDTH = 240
-"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without spawning."""
+DEPTH_PIXELS = 240
+"""Depth maps are drawn with at most this longer side, and enlarged: they cost most of a frame without spawning."""
 
 
 @dataclass(frozen=True)
@@ -426,7 +426,7 @@ def _colored_by_depth(gaussians: Gaussians, viewport: Viewport) -> Gaussians:
 
 
 def _reduced(camera: Camera) -> Camera:
-    return camera.scaled(min(1.0, DEPTH_WIDTH / camera.width))
+    return camera.scaled(min(1.0, DEPTH_PIXELS / max(camera.width, camera.height)))
 
 
 @dataclass(frozen=True)

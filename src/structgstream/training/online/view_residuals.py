@@ -80,7 +80,7 @@ def _view_residuals(
 ) -> list[ViewResidual]:
     """Of views of one size, all or none of which were drawn and have a floor."""
     views = [view for _, view, _ in given]
-    small = reduced_views(views, min(1.0, rules.picture_width / views[0].camera.width))
+    small = reduced_views(views, min(1.0, rules.longer_side / max(views[0].camera.width, views[0].camera.height)))
     pictures, masks = torch.stack([view.image for view in small]), stacked_masks(small)
     images = [image for image, _, _ in given if image is not None]
     selected = [of_view for _, _, of_view in given if of_view is not None]
