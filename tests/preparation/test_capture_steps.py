@@ -163,6 +163,23 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
     assert one.steps.summaries["check"] == f"{count}; report/index.html"
 
 
+def test_an_interrupted_report_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where an earlier result fits, as its pictures are no longer those of the folder."""
+    _, steps, content = brought(tmp_path)
+    steps.check(steps.points(content))
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr("structgstream.preparation.prepare.write_report", interrupt)
+        _, steps, content = brought(tmp_path)
+        steps.check(steps.points(replace(content, near=0.5)))
+    again, steps, content = brought(tmp_path)
+    steps.check(steps.points(content))
+    assert "check" not in again.steps.skipped
+
+
 def test_a_size_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         made(tmp_path / "videos", replace(NONE, field_of_view=181.0))

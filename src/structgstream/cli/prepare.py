@@ -88,7 +88,7 @@ class Prepare:
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """With --check: folder of the report. Default: FOLDER/report."""
+    """With --check: folder of the report, new or that of an earlier one. Default: FOLDER/report."""
 
 
 def main(arguments: list[str]) -> None:

@@ -37,6 +37,7 @@ from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
+from structgstream.owned_folders import own_folder
 from structgstream.pose_check.check import Finding
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
@@ -56,7 +57,7 @@ from structgstream.preparation.output_folder import (
     remove_others,
     unlink,
 )
-from structgstream.preparation.report import write_report
+from structgstream.preparation.report import PURPOSE, write_report
 from structgstream.preparation.roving import frames_named, open_roving, write_png
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
@@ -332,7 +333,10 @@ class Job:
             write_prepared(self.capture, replace(content, sound=found))
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
+        result = self.capture / FOLDER / "check.json"
+
         def look() -> tuple[Finding, ...]:
+            result.unlink(missing_ok=True)  # an interruption leaves a page of another result
             source = self._source(content)
             checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
             checked = replace(checked, report=replace(checked.report, steps=dict(self.steps.summaries)))
@@ -340,7 +344,7 @@ class Job:
             return checked.report.findings
 
         if not (self.capture / REPORT / "index.html").is_file():
-            (self.capture / FOLDER / "check.json").unlink(missing_ok=True)
+            result.unlink(missing_ok=True)
         return self.steps.run(
             "check",
             self._inputs(content),
@@ -529,7 +533,10 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
     listener = listener or Silent()
     listener.begin("check", skipped=False)
     unit = read_prepared(path).unit if recognizes_prepared(path) else None
-    checked = check_capture(open_capture(path), unit=unit, listener=listener)
+    source = open_capture(path)
+    if report is not None:
+        own_folder(report, PURPOSE)  # before the check, which takes minutes
+    checked = check_capture(source, unit=unit, listener=listener)
     if report is not None:
         write_report(report, checked, listener=listener)
     listener.end("check", f"{len(checked.report.findings)} findings")

@@ -38,7 +38,7 @@ def test_the_page_shows_everything_and_loads_nothing(tmp_path: Path) -> None:
     assert "&lt;room&gt;" in page
     assert "http" not in page
     pictures = re.findall(r"<img src='([^']+)'", page)
-    assert {f"camera_{name}.png" for name in rig} <= set(pictures)
+    assert {f"camera_{number}.png" for number in range(5)} <= set(pictures)
     assert {"pairs.png", "coverage.png", "colors.png"} <= set(pictures)
     for name in pictures:
         assert pixels_of(tmp_path / "report" / name).std() > 5
@@ -48,21 +48,22 @@ def test_the_page_shows_everything_and_loads_nothing(tmp_path: Path) -> None:
     assert numbers["median_epipolar_pixels"] == report.median_epipolar_pixels
 
 
-def test_an_earlier_report_goes_and_nothing_else(tmp_path: Path) -> None:
-    (tmp_path / "camera_old.png").write_text("")
-    (tmp_path / "notes.txt").write_text("")
-    rig = room_rig(4)
-    write_report(tmp_path, check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)])))
-    assert (tmp_path / "notes.txt").is_file()
-    assert not (tmp_path / "camera_old.png").exists()
-
-
-def test_no_room_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
+def test_an_earlier_report_goes_and_nothing_of_anybody_else(tmp_path: Path) -> None:
     rig = room_rig(4)
     checked = check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)]))
-    with pytest.raises(StorageError, match="cannot be written"):
-        write_report(tmp_path / "file", checked)
+    write_report(tmp_path / "report", checked)
+    for name in ("camera_9.png", "camera_front.png"):
+        (tmp_path / "report" / name).write_text("")
+    write_report(tmp_path / "report", checked)
+    assert not (tmp_path / "report" / "camera_9.png").exists()
+    assert (tmp_path / "report" / "camera_front.png").is_file()
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text("mine")
+    for place in ("site", "site/index.html"):
+        with pytest.raises(StorageError, match="report of a check"):
+            write_report(tmp_path / place, checked)
+    assert [path.name for path in (tmp_path / "site").iterdir()] == ["index.html"]
+    assert (tmp_path / "site" / "index.html").read_text() == "mine"
 
 
 def report_of(cameras: dict[str, CameraCheck], pairs: tuple[PairCheck, ...] = ()) -> CheckReport:
