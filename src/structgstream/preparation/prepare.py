@@ -457,6 +457,12 @@ def assembled(
     footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, options: PrepareOptions
 ) -> PreparedCapture:
     """The content of ``capture.json`` with the usual near plane, without points."""
+    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
+    if not footage.tracks:
+        # Pictures are counted at the rate of the capture, which is that of most cameras by their clocks.
+        usual = float(np.median([clocks.get(name, Clock()).rate for name in footage.cameras]))
+        fps = footage.fps / usual
+        clocks = {name: replace(clock, rate=clock.rate / usual) for name, clock in clocks.items()}
     cameras = {}
     for name in footage.cameras:
         filmed = solved.cameras[name]
@@ -466,7 +472,6 @@ def assembled(
     rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
     held_out = held_out_of(options, rig)
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
-    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
     walked = {} if solved.roving is None else solved.roving.cameras
     roving = {name: PreparedCamera(f"{name}.png", filmed, rectilinear(filmed)) for name, filmed in walked.items()}
     unit: Unit = "metres" if solved.metres else "arbitrary"
