@@ -39,6 +39,7 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.owned_folders import own_folder
 from structgstream.pose_check.check import Finding
+from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
@@ -60,13 +61,14 @@ from structgstream.preparation.output_folder import (
 from structgstream.preparation.report import PURPOSE, write_report
 from structgstream.preparation.roving import frames_named, open_roving, write_png
 from structgstream.preparation.solvers import (
-    TIMESTAMPS,
     Clocks,
+    board_footage,
     calibration_key,
     check_complete,
     describe_focals,
     describe_turns,
     find_calibration,
+    find_timestamps,
     first_clocks,
     given_cameras,
     packed,
@@ -140,7 +142,7 @@ class Job:
 
         inputs = {
             "files": fingerprint(footage.files),
-            "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
+            "table": None if (table := find_timestamps(footage)) is None else fingerprint({"table": table}),
             "fps": footage.fps,
             "how": self.options.synchronize,
             "calibration": method if isinstance(method, str) else calibration_key(method),
@@ -398,7 +400,8 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
 
 
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
-    """Refuses options that have no effect, so that their user expects another capture."""
+    """Refuses options that have no effect, so that their user expects another capture, and those of which only a later
+    step would find that they cannot be."""
     if options.fps is not None and footage.tracks:
         raise ConfigError(
             f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
@@ -408,6 +411,10 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
         )
+    if method == "board" and options.board_videos is not None:
+        board_footage(footage, options)  # raises
+    if options.board != Board() and method != "board":
+        raise ConfigError("A board (--board) is looked for by --calibration board alone; choose that, or leave it out.")
     if options.intrinsics != "own" and method != "sfm":
         raise ConfigError(
             "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
@@ -422,6 +429,10 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             "Refining (--refine) adjusts the still cameras alone, so the frames of a roving video (--roving) would no "
             "longer fit them; leave out one of the two."
+        )
+    if options.lens == "brown" and options.refine:
+        raise ConfigError(
+            "Lenses of the model brown cannot be refined; take --lens opencv, or leave out --refine or --lens."
         )
     if options.lens is not None and isinstance(method, Calibration) and not options.refine:
         raise ConfigError(

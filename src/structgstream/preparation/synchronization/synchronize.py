@@ -157,7 +157,7 @@ def synchronize(
         raise ConfigError(f"The method of synchronisation must be one of {', '.join(METHODS)}, got {method!r}.")
     if method == "csv" and timestamps is None:
         raise ConfigError(
-            "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds; give its path."
+            "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds beside the videos."
         )
     stamps = {name: np.asarray(footage.stamps(name), np.float64) for name in footage.cameras}
     for name, own in stamps.items():
