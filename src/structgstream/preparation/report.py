@@ -22,7 +22,6 @@ from structgstream.owned_folders import own_folder, remove_own
 from structgstream.pose_check.tracks import pair_errors
 from structgstream.preparation.checking.check import Checked, CheckReport, Examination
 from structgstream.preparation.checking.overlap import cameras_per_point
-from structgstream.preparation.checking.times import SIGMAS
 from structgstream.preparation.output_folder import Listener, Silent
 
 if TYPE_CHECKING:
@@ -140,7 +139,6 @@ def draw_times(path: Path, report: CheckReport) -> None:
     names = list(known)
     values = np.array([camera.offset_ms for camera in known.values()], float)
     spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
-    late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as in time_findings
     title = "Time against the other cameras (bars: two standard deviations)"
     figure, axis = _chart(names, title, "late by, milliseconds")
     axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)
@@ -149,11 +147,7 @@ def draw_times(path: Path, report: CheckReport) -> None:
     axis.annotate(
         "5 ms", (1.0, LIMIT_MS), xycoords=("axes fraction", "data"), fontsize=8, color=COLORS[2], ha="left", va="center"
     )
-    for mask, color in ((~late, COLORS[0]), (late, COLORS[3])):
-        if mask.any():
-            axis.errorbar(
-                np.flatnonzero(mask), values[mask], yerr=2 * spread[mask], fmt="o", color=color, markersize=5, capsize=3
-            )
+    axis.errorbar(range(len(names)), values, yerr=2 * spread, fmt="o", color=COLORS[0], markersize=5, capsize=3)
     limit = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
     axis.set_ylim(-limit, limit)
     save_figure(figure, path)

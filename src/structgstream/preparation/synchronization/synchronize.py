@@ -265,7 +265,7 @@ def require_motion(changes: Mapping[str, Changes]) -> None:
     if still:
         raise CaptureError(
             f"Too little moves in the pictures of {', '.join(repr(name) for name in still)} to synchronise by "
-            "motion; film people who move, a clap for audio, or give timestamps.csv."
+            f"motion; film people who move in the first {MOTION_SECONDS:g} s, a clap for audio, or give timestamps.csv."
         )
 
 
