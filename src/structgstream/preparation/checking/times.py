@@ -120,8 +120,8 @@ def _stated_lateness(source: FrameSource) -> dict[str, float]:
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
-    """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on; a
-    note if none can be judged.
+    """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on,
+    a note if none can be judged.
 
     Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
     between those of the others get one warning.

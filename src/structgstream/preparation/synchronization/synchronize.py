@@ -49,7 +49,6 @@ class Synchronization:
     are of."""
     uncertainty_seconds: Mapping[str, float]
     """Camera to the standard error of its common times, relative to the mean of all cameras."""
-    residual_seconds: Mapping[str, float]  # see :func:`frame_residuals`
     method: str  # how they were found: ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
     reason: str  # why this method was chosen, a sentence
     warnings: tuple[str, ...]  # what the user should know, sentences
@@ -82,7 +81,7 @@ def synchronization(
             f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
         )
-    return Synchronization(clocks, uncertainties, residuals, method, reason, warnings)
+    return Synchronization(clocks, uncertainties, method, reason, warnings)
 
 
 def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
