@@ -46,8 +46,11 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "-o CAPTURE" in capsys.readouterr().err
     assert main(["prepare", str(tmp_path), "-o", str(tmp_path / "out"), "--size", "720p"]) == 2
     assert "WIDTHxHEIGHT" in capsys.readouterr().err
-    assert main(["prepare", "--check", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    capsys.readouterr()
+    for ignored in (["-o", str(tmp_path / "out")], ["--lens", "brown"]):
+        assert main(["prepare", "--check", str(tmp_path), *ignored]) == 2
+        assert "it takes --report alone" in " ".join(capsys.readouterr().err.split())
+    assert main(["prepare", str(tmp_path), "-o", str(tmp_path / "out"), "--report", str(tmp_path / "report")]) == 2
+    assert "--report goes with --check" in capsys.readouterr().err
     assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
     assert "is missing; give the folder" in capsys.readouterr().err
 

@@ -145,6 +145,28 @@ def test_folders_of_pictures(tmp_path: Path) -> None:
     assert all_numbers(source.frames(0))[0] == [(0, 1), (1, 0), (2, 1), (3, 1)]
 
 
+@pytest.mark.parametrize("folder", ["videos", "pictures"])
+def test_pictures_and_videos_are_paired_alike(tmp_path: Path, folder: str) -> None:
+    """Four cameras of one trigger whose times lie around half a period, and one of them is slower by a tenth."""
+    capture = content(folder=folder, suffix="" if folder == "pictures" else ".mp4")
+    clocks = [Clock(12.35 + jitter, rate) for jitter, rate in ((2e-4, 1), (-1e-4, 1), (1e-4, 1), (-2e-4, 1.1))]
+    cameras = {
+        name: replace(camera, clock=clock)
+        for (name, camera), clock in zip(capture.cameras.items(), clocks, strict=True)
+    }
+    for number, name in enumerate(cameras):
+        for frame in range(12 if folder == "pictures" else 0):
+            write_picture(tmp_path / folder / name / f"{frame:03d}.png", picture(number, frame))
+    if folder == "videos":
+        write_videos(tmp_path / folder, list(cameras), frames=12)
+    write_prepared(tmp_path, replace(capture, cameras=cameras, held_out=frozenset()))
+    source = open_capture(tmp_path)
+    paired = [[frame for _, frame in own] for own in all_numbers(source.frames(0))]
+    assert paired == [[n] * 4 for n in range(6)] + [[6] * 3] + [[n, n, n, n - 1] for n in range(7, 12)]
+    apart = apart_seconds(source)
+    assert apart["cam03"][4] - apart["cam00"][4] == pytest.approx(4 * 0.1 / 30 - 4e-4)
+
+
 def test_points_come_along_unless_another_camera_is_held_out(tmp_path: Path) -> None:
     capture = replace(content(), points="points.npy")
     write_videos(tmp_path / "videos", list(capture.cameras), frames=2)

@@ -11,7 +11,8 @@ from PIL import Image
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.errors import CalibrationError, ConfigError
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
@@ -70,8 +71,11 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
         ("sfm", PrepareOptions(board_videos=tmp_path), "--calibration board alone"),
         ("board", PrepareOptions(intrinsics="shared"), "by structure from motion alone"),
         (given, PrepareOptions(lens="fisheye"), r"cameras\.json states the lenses, so --lens fisheye has no effect"),
+        ("sfm", PrepareOptions(board=Board(10, 7, 0.03)), r"A board \(--board\) is looked for by --calibration board"),
+        ("sfm", PrepareOptions(lens="brown", refine=True), "model brown cannot be refined; take --lens opencv"),
+        ("board", PrepareOptions(board_videos=tmp_path / "nowhere"), "nowhere is missing; give the folder"),
     ):
-        with pytest.raises(ConfigError, match=reported):
+        with pytest.raises((ConfigError, CaptureError), match=reported):
             check_used(method, there, options)
     check_used("sfm", stills, PrepareOptions(fps=25))
     check_used("board", there, PrepareOptions(board_videos=tmp_path, lens="brown"))

@@ -56,6 +56,21 @@ def test_the_content_of_a_capture(tmp_path: Path) -> None:
     assert {(one.pinhole.width, one.pinhole.height) for one in small.cameras.values()} == {(64, 48)}
 
 
+def test_the_rate_of_pictures_is_that_of_most_cameras_by_their_clocks(tmp_path: Path) -> None:
+    footage, solved, _ = made(tmp_path / "videos")
+    for name in footage.cameras:
+        (tmp_path / "stills" / name).mkdir(parents=True)
+        shown = next(footage.pictures(name, [0]))
+        cv2.imwrite(str(tmp_path / "stills" / name / "0.png"), shown)
+    rates = dict(zip(footage.cameras, (1.001, 1.001, 1.001, 1.0), strict=True))
+    clocks = {name: Clock(12.0, rate) for name, rate in rates.items()}
+    content = assembled(find_footage(tmp_path / "stills"), clocks, solved, NONE)
+    assert content.fps == pytest.approx(30 / 1.001)
+    for name, camera in content.cameras.items():
+        again = camera.clock.common_seconds(np.arange(9) / content.fps)
+        np.testing.assert_allclose(again, 12.0 + rates[name] * np.arange(9) / 30)
+
+
 def test_who_is_held_out(tmp_path: Path) -> None:
     _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("cam01", "cam03")))
     assert content.held_out == {"cam01", "cam03"}
@@ -161,6 +176,25 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
     assert report.is_file()
     count = f"{len(findings)} finding{'s' * (len(findings) != 1)}"
     assert one.steps.summaries["check"] == f"{count}; report/index.html"
+
+
+def test_an_interrupted_report_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where an earlier result fits, as its pictures are no longer those of the folder."""
+    _, steps, content = brought(tmp_path)
+    steps.check(steps.points(content))
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    _, steps, content = brought(tmp_path)
+    content = steps.points(replace(content, near=0.5))
+    with monkeypatch.context() as patched:
+        patched.setattr("structgstream.preparation.prepare.write_report", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            steps.check(content)
+    again, steps, content = brought(tmp_path)
+    steps.check(steps.points(content))
+    assert "check" not in again.steps.skipped
 
 
 def test_a_size_that_cannot_be(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from structgstream.preparation.options import (
 
 
 def test_lengths() -> None:
-    assert [parse_length(text) for text in ("3.2m", "320cm", "3200 mm", "3.2")] == pytest.approx([3.2] * 4)
+    assert [parse_length(text) for text in ("3.2m", "320cm", "3200 mm")] == pytest.approx([3.2] * 3)
     assert parse_length("10ft") == pytest.approx(3.048)
-    for wrong in ("", "m", "-1m", "0m", "3 parsec"):
+    for wrong in ("", "m", "-1m", "0m", "3 parsec", "50"):
         with pytest.raises(ConfigError, match="positive number with its unit"):
             parse_length(wrong)
 

@@ -50,9 +50,12 @@ def table(footage: Footage, late: dict[str, float]) -> None:
     (footage.where / TIMESTAMPS).write_text("\n".join(lines) + "\n")
 
 
-def test_a_table_of_times_is_taken_by_itself(tmp_path: Path) -> None:
-    footage = filmed(tmp_path)
+@pytest.mark.parametrize(("videos", "beside"), [("", ""), ("videos", ""), ("videos", "videos")])
+def test_a_table_of_times_is_taken_by_itself(tmp_path: Path, videos: str, beside: str) -> None:
+    filmed(tmp_path / videos)
+    footage = find_footage(tmp_path)
     table(footage, {"b": 0.1})
+    (tmp_path / TIMESTAMPS).replace(tmp_path / beside / TIMESTAMPS)
     found = synchronized(footage, PrepareOptions())
     assert (found.method, found.sure) == ("csv", True)
     starts = {name: clock.offset_seconds for name, clock in found.clocks.items()}

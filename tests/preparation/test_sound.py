@@ -111,6 +111,19 @@ def test_a_recorder_s_file_is_put_in_step_by_what_cameras_hear(
     assert part.clock.offset_seconds == pytest.approx(-early - 0.1, abs=0.002)
 
 
+def test_cameras_that_do_not_hear_a_file_keep_no_other_from_being_compared(
+    capture: Path, noises: NDArray[np.float32], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("structgstream.preparation.sound.MAX_HEARING", 1)
+    folder = tmp_path / "clip"
+    shutil.copytree(capture, folder)
+    add_sound(Path(CLIP) / "cam00.mp4", tmp_path / "cam00.mp4", claps(5.0, 1.0, 2.0, 2.2, 4.1)).replace(
+        folder / "cam00.mp4"
+    )
+    recorder = write_sound(tmp_path / "recorder.wav", noises[:, RATE:])
+    assert file_sound(open_capture(folder), recorder).clock.offset_seconds == pytest.approx(1.0, abs=0.002)
+
+
 def test_a_file_that_no_camera_hears_begins_with_the_capture_which_is_said(
     capture: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

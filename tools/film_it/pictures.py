@@ -20,8 +20,8 @@ from structgstream.preparation.prepare import check_folder
 
 TURNED, DEGREES = "cam04", 0.6
 QUALITY, WIDEST = 82, 1000
-FINE = {"camera_cam00.png": "camera", "coverage.png": "coverage", "lines_1.png": "lines"}
-OFF = {f"camera_{TURNED}.png": "camera-off", "pairs.png": "pairs"}
+FINE = {"camera_0.png": "camera", "coverage.png": "coverage", "lines_1.png": "lines"}
+OFF = {"camera_4.png": "camera-off", "pairs.png": "pairs"}
 
 
 def turned_clip(folder: Path) -> Path:

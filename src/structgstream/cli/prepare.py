@@ -65,7 +65,7 @@ class Prepare:
     synchronize: Annotated[
         Literal["auto", "csv", "stamps", "audio", "motion", "none"], tyro.conf.arg(help_behavior_hint="")
     ] = "auto"
-    """How clocks are found: by timestamps.csv in FOLDER, the files' own times, sound, motion, or not at all
+    """How clocks are found: by timestamps.csv beside the videos, the files' own times, sound, motion, or not at all
     (one signal starts all cameras). Default: csv if it is there, else sound, else motion."""
     field_of_view: Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Across the undistorted pictures. Default: the largest without black borders, up to 110."""
@@ -88,7 +88,7 @@ class Prepare:
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """With --check: folder of the report. Default: FOLDER/report."""
+    """With --check: folder of the report, new or that of an earlier one. Default: FOLDER/report."""
 
 
 def main(arguments: list[str]) -> None:
@@ -96,12 +96,12 @@ def main(arguments: list[str]) -> None:
     options = parse_options(Prepare, "prepare", arguments=arguments)
     check_ending(options.output, command="prepare", folder=True)
     check_ending(options.report, command="prepare", option="--report", folder=True)
-    if options.check == (options.output is not None):
-        raise UsageError(
-            "--check looks at a capture that is there, so it takes no --output."
-            if options.check
-            else "prepare needs the folder to make: -o CAPTURE (or --check to look at a capture)."
-        )
+    if options.check and options != Prepare(options.videos, check=True, report=options.report):
+        raise UsageError("--check looks at a capture that is there, so of the other options it takes --report alone.")
+    if not options.check and options.output is None:
+        raise UsageError("prepare needs the folder to make: -o CAPTURE (or --check to look at a capture).")
+    if not options.check and options.report is not None:
+        raise UsageError("--report goes with --check; without it the report is CAPTURE/report.")
     console = Console()
     findings = _check(options, console) if options.check else _prepare(options, console)
     _conclude(findings, console)

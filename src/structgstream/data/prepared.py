@@ -25,7 +25,7 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, picture_siz
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, positive, read_array, read_json, readable
-from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
+from structgstream.data.timeline import Clock, common_slots, log_time_error, natural, origin_of, picture_slots, place
 from structgstream.data.undistortion import undistorted_to
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
@@ -178,27 +178,30 @@ def pictures_of(folder: Path) -> tuple[Path, ...]:
 def _of_folders(
     path: Path, files: Mapping[str, Path], rig: CameraRig, capture: PreparedCapture, points: NDArray[np.float64] | None
 ) -> ImageSource:
-    """Folders of pictures at the capture's rate; clocks shift them by whole frames, and what lacks is absent."""
+    """Folders of pictures that are counted at the capture's rate, in step by their clocks as videos are."""
     found = {name: pictures_of(folder) for name, folder in files.items()}
     if empty := [name for name, pictures in found.items() if not pictures]:
         raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
-    shifts = {name: round(capture.cameras[name].clock.offset_seconds * capture.fps) for name in rig}
-    slots = {name: (own + shifts[name]).tolist() for name, own in picture_slots(found).items()}
+    positions = {
+        name: capture.cameras[name].clock.common_seconds(own / capture.fps) * capture.fps
+        for name, own in picture_slots(found).items()
+    }
+    origin = origin_of(list(positions.values()))
+    placed = {name: place(own - origin) for name, own in positions.items()}
+    slots = {name: own.slots.tolist() for name, own in placed.items()}
     common = common_slots(slots, where=str(path), label=lambda slot: f"instant {slot}", training=rig.training)
-    cut: dict[str, tuple[Path | None, ...]] = {}
+    log_time_error(placed, common, fps=capture.fps, where=str(path))
+    cut, errors = {}, {}
     for name, pictures in found.items():
-        picture_of = dict(zip(slots[name], pictures, strict=True))
-        cut[name] = tuple(picture_of.get(slot) for slot in common)
+        frames, apart = placed[name].within(common)
+        cut[name] = tuple(None if frame is None else pictures[frame] for frame in frames)
+        errors[name] = apart / capture.fps
         size, own = picture_size(pictures[0]), (rig[name].width, rig[name].height)
         if size != own:
             raise CalibrationError(
                 f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
-    errors = {}
-    for name, shift in shifts.items():
-        late = capture.cameras[name].clock.offset_seconds - shift / capture.fps
-        errors[name] = np.array([np.nan if file is None else late for file in cut[name]])
     return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=errors)
 
 

@@ -244,6 +244,13 @@ class Placed:
     errors: Floats  # ``[n]``, time of the frame minus the instant, in periods
     repeated: tuple[int, ...]  # slots that two frames of one instant compete for, which regular videos do not have
 
+    def within(self, instants: range) -> tuple[list[int | None], Floats]:
+        """Of each instant the frame, or None, and that frame's error in periods, ``[N]``, NaN without a frame."""
+        row_of = {slot: row for row, slot in enumerate(self.slots.tolist())}
+        rows = [row_of.get(instant) for instant in instants]
+        frames = [None if row is None else int(self.frames[row]) for row in rows]
+        return frames, np.array([np.nan if row is None else self.errors[row] for row in rows])
+
 
 def place(positions: Floats) -> Placed:
     """The frames of a camera at ``positions`` ``[n]``, ascending: their times in periods, instants being integers."""

@@ -174,11 +174,9 @@ def synchronised(
     log_time_error(placed, common, fps=rate, where=str(where))
     stamps, errors = {}, {}
     for name, own in placed.items():
-        frame_of = dict(zip(own.slots.tolist(), own.frames.tolist(), strict=True))
-        stamps[name] = tuple(tracks[name].stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
-        inside = (own.slots >= common.start) & (own.slots < common.stop)
-        errors[name] = np.full(len(common), np.nan)
-        errors[name][own.slots[inside] - common.start] = own.errors[inside] / rate
+        frames, apart = own.within(common)
+        stamps[name] = tuple(None if frame is None else tracks[name].stamps[frame] for frame in frames)
+        errors[name] = apart / rate
     return VideoSource(where.name, rig, rate, tracks, stamps, points, errors)
 
 

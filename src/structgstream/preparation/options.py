@@ -16,7 +16,7 @@ from structgstream.preparation.synchronization.synchronize import Method
 
 Link = Literal["hard", "symlink", "copy"]
 METHODS = ("auto", "sfm", "board")
-UNITS_IN_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
+UNITS_IN_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)

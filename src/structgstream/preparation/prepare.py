@@ -37,7 +37,9 @@ from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
+from structgstream.owned_folders import own_folder
 from structgstream.pose_check.check import Finding
+from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
@@ -56,16 +58,17 @@ from structgstream.preparation.output_folder import (
     remove_others,
     unlink,
 )
-from structgstream.preparation.report import write_report
+from structgstream.preparation.report import PURPOSE, write_report
 from structgstream.preparation.roving import frames_named, open_roving, write_png
 from structgstream.preparation.solvers import (
-    TIMESTAMPS,
     Clocks,
+    board_footage,
     calibration_key,
     check_complete,
     describe_focals,
     describe_turns,
     find_calibration,
+    find_timestamps,
     first_clocks,
     given_cameras,
     packed,
@@ -139,7 +142,7 @@ class Job:
 
         inputs = {
             "files": fingerprint(footage.files),
-            "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
+            "table": None if (table := find_timestamps(footage)) is None else fingerprint({"table": table}),
             "fps": footage.fps,
             "how": self.options.synchronize,
             "calibration": method if isinstance(method, str) else calibration_key(method),
@@ -332,7 +335,10 @@ class Job:
             write_prepared(self.capture, replace(content, sound=found))
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
+        result = self.capture / FOLDER / "check.json"
+
         def look() -> tuple[Finding, ...]:
+            result.unlink(missing_ok=True)  # an interruption leaves a page of another result
             source = self._source(content)
             checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
             checked = replace(checked, report=replace(checked.report, steps=dict(self.steps.summaries)))
@@ -340,7 +346,7 @@ class Job:
             return checked.report.findings
 
         if not (self.capture / REPORT / "index.html").is_file():
-            (self.capture / FOLDER / "check.json").unlink(missing_ok=True)
+            result.unlink(missing_ok=True)
         return self.steps.run(
             "check",
             self._inputs(content),
@@ -394,7 +400,8 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
 
 
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
-    """Refuses options that have no effect, so that their user expects another capture."""
+    """Refuses options that have no effect, so that their user expects another capture, and those of which only a later
+    step would find that they cannot be."""
     if options.fps is not None and footage.tracks:
         raise ConfigError(
             f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
@@ -404,6 +411,10 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
         )
+    if method == "board" and options.board_videos is not None:
+        board_footage(footage, options)  # raises
+    if options.board != Board() and method != "board":
+        raise ConfigError("A board (--board) is looked for by --calibration board alone; choose that, or leave it out.")
     if options.intrinsics != "own" and method != "sfm":
         raise ConfigError(
             "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
@@ -418,6 +429,10 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             "Refining (--refine) adjusts the still cameras alone, so the frames of a roving video (--roving) would no "
             "longer fit them; leave out one of the two."
+        )
+    if options.lens == "brown" and options.refine:
+        raise ConfigError(
+            "Lenses of the model brown cannot be refined; take --lens opencv, or leave out --refine or --lens."
         )
     if options.lens is not None and isinstance(method, Calibration) and not options.refine:
         raise ConfigError(
@@ -453,6 +468,12 @@ def assembled(
     footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, options: PrepareOptions
 ) -> PreparedCapture:
     """The content of ``capture.json`` with the usual near plane, without points."""
+    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
+    if not footage.tracks:
+        # Pictures are counted at the rate of the capture, which is that of most cameras by their clocks.
+        usual = float(np.median([clocks.get(name, Clock()).rate for name in footage.cameras]))
+        fps = footage.fps / usual
+        clocks = {name: replace(clock, rate=clock.rate / usual) for name, clock in clocks.items()}
     cameras = {}
     for name in footage.cameras:
         filmed = solved.cameras[name]
@@ -462,7 +483,6 @@ def assembled(
     rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
     held_out = held_out_of(options, rig)
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
-    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
     walked = {} if solved.roving is None else solved.roving.cameras
     roving = {name: PreparedCamera(f"{name}.png", filmed, rectilinear(filmed)) for name, filmed in walked.items()}
     unit: Unit = "metres" if solved.metres else "arbitrary"
@@ -529,7 +549,10 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
     listener = listener or Silent()
     listener.begin("check", skipped=False)
     unit = read_prepared(path).unit if recognizes_prepared(path) else None
-    checked = check_capture(open_capture(path), unit=unit, listener=listener)
+    source = open_capture(path)
+    if report is not None:
+        own_folder(report, PURPOSE)  # before the check, which takes minutes
+    checked = check_capture(source, unit=unit, listener=listener)
     if report is not None:
         write_report(report, checked, listener=listener)
     listener.end("check", f"{len(checked.report.findings)} findings")

@@ -16,13 +16,12 @@ import numpy as np
 
 from structgstream.atomic_files import atomic_write
 from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix, level_normal
-from structgstream.errors import StorageError
 from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.geometry import Floats
+from structgstream.owned_folders import own_folder, remove_own
 from structgstream.pose_check.tracks import pair_errors
 from structgstream.preparation.checking.check import Checked, CheckReport, Examination
 from structgstream.preparation.checking.overlap import cameras_per_point
-from structgstream.preparation.checking.times import SIGMAS
 from structgstream.preparation.output_folder import Listener, Silent
 
 if TYPE_CHECKING:
@@ -140,7 +139,6 @@ def draw_times(path: Path, report: CheckReport) -> None:
     names = list(known)
     values = np.array([camera.offset_ms for camera in known.values()], float)
     spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
-    late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as in time_findings
     title = "Time against the other cameras (bars: two standard deviations)"
     figure, axis = _chart(names, title, "late by, milliseconds")
     axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)
@@ -149,11 +147,7 @@ def draw_times(path: Path, report: CheckReport) -> None:
     axis.annotate(
         "5 ms", (1.0, LIMIT_MS), xycoords=("axes fraction", "data"), fontsize=8, color=COLORS[2], ha="left", va="center"
     )
-    for mask, color in ((~late, COLORS[0]), (late, COLORS[3])):
-        if mask.any():
-            axis.errorbar(
-                np.flatnonzero(mask), values[mask], yerr=2 * spread[mask], fmt="o", color=color, markersize=5, capsize=3
-            )
+    axis.errorbar(range(len(names)), values, yerr=2 * spread, fmt="o", color=COLORS[0], markersize=5, capsize=3)
     limit = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
     axis.set_ylim(-limit, limit)
     save_figure(figure, path)
@@ -418,19 +412,24 @@ COLUMNS = (
 
 
 PAGE, NUMBERS = "index.html", "report.json"
+PURPOSE = "report of a check"
+DRAWN = re.compile(r"(camera|lines)_\d+\.png|times\.png|colors\.png")
+"""Pictures that another capture, or another check, may have fewer of."""
 
 
 def write_report(folder: Path, checked: Checked, *, listener: Listener | None = None) -> Path:
-    """The report in ``folder``, in place of an earlier one; returns the page."""
+    """The report in ``folder``, in place of an earlier one; returns the page. Raises StorageError if the folder holds
+    something else or cannot be written."""
     report, examined = checked.report, checked.examination
-    _empty(folder)
+    own_folder(folder, PURPOSE)
+    remove_own(folder, PURPOSE, DRAWN)
     listener = listener or Silent()
     pairs = chosen_pairs(examined)
     total = len(examined.cameras) + len(pairs)
     overlays, lines = [], []
     for number, name in enumerate(examined.cameras):
         listener.progress(number, total, f"picture of {name}")
-        overlays.append(f"camera_{re.sub(r'[^0-9A-Za-z._-]', '_', name)}.png")
+        overlays.append(f"camera_{number}.png")
         draw_overlay(folder / overlays[-1], examined, report, name)
     for number, pair in enumerate(pairs):
         listener.progress(len(examined.cameras) + number, total, "epipolar lines")
@@ -457,14 +456,3 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
     atomic_write(folder / PAGE, page(report, off=examined.suspects.off, sections=sections).encode())
     listener.progress(total, total, "")
     return folder / PAGE
-
-
-def _empty(folder: Path) -> None:
-    """Removes an earlier report, and nothing else."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for pattern in ("camera_*.png", "lines_*.png", "times.png", "colors.png"):
-            for file in folder.glob(pattern):
-                file.unlink()
-    except OSError as error:
-        raise StorageError(f"The report in {folder} cannot be written ({error.strerror}); choose another.") from None

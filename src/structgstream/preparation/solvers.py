@@ -4,6 +4,7 @@
 What the pictures do not allow is a ``CalibrationError``, what cannot be read or synchronised a ``CaptureError``.
 """
 
+import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -65,9 +66,8 @@ def synchronized(
     """
     single = all(len(footage.stamps(name)) == 1 for name in footage.cameras)
     chosen: Method = "none" if single else options.synchronize
-    table = footage.where / TIMESTAMPS
     try:
-        found = synchronize(footage, method=chosen, timestamps=table if table.is_file() else None, cameras=cameras)
+        found = synchronize(footage, method=chosen, timestamps=find_timestamps(footage), cameras=cameras)
     except CaptureError as error:
         if chosen != "auto":
             raise
@@ -76,6 +76,12 @@ def synchronized(
     summary = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
     sure = found.method != "motion" or max(found.uncertainty_seconds.values()) <= SURE_PERIODS / footage.fps
     return Clocks(found.clocks, found.method, summary, sure)
+
+
+def find_timestamps(footage: Footage) -> Path | None:
+    """The table of times: beside the videos, which may lie below the folder that was given, or in that one."""
+    beside = Path(os.path.commonpath(footage.files.values()))
+    return next((table for folder in (beside, footage.where) if (table := folder / TIMESTAMPS).is_file()), None)
 
 
 def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
@@ -87,7 +93,7 @@ def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
     try:
         return synchronized(footage, options)
     except CaptureError as error:
-        if options.synchronize not in ("auto", "motion") or (footage.where / TIMESTAMPS).is_file():
+        if options.synchronize not in ("auto", "motion") or find_timestamps(footage) is not None:
             raise
         summary = f"motion: not without the calibration. {error}"
         return Clocks({name: Clock() for name in footage.cameras}, "motion", summary, sure=False)

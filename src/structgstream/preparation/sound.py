@@ -36,14 +36,14 @@ CLIPPED_AT, CLIPPED_SHARE, CLIPPED_DECIBELS = 0.99, 1e-4, 20.0
 """A microphone of which more than this share of samples is this large is overdriven, and counts as that much worse."""
 DRIFT_SECONDS = 60.0
 """Instants that both hear must lie this far apart for the rate of a file's clock; nearer ones give an offset alone."""
-MAX_COMPARED = 4
-"""Cameras with which a file is compared."""
+MAX_HEARING = 4
+"""Cameras that hear a file, after which no more are compared with it."""
 AUTO, NONE = "auto", "none"
 
 
-def loudness(samples: NDArray[np.float32], *, rate: float = SAMPLE_RATE) -> float | None:
+def loudness(samples: NDArray[np.float32]) -> float | None:
     """Decibels by which what happens stands out from the noise in a recording ``[N]``; None for silence."""
-    length = round(LEVEL_SECONDS * rate)
+    length = round(LEVEL_SECONDS * SAMPLE_RATE)
     count = len(samples) // length
     if count < 2 or not np.ptp(samples) > 0:
         return None
@@ -168,7 +168,6 @@ def _clock_by_cameras(source: FrameSource, path: Path) -> Clock | None:
     if samples is None:
         return None
     clocks: list[Clock] = []
-    compared = 0
     for name, video in camera_videos(source).items():
         own = recording(video)
         camera = camera_clock(source, name)
@@ -179,8 +178,7 @@ def _clock_by_cameras(source: FrameSource, path: Path) -> Clock | None:
         except UnusableSoundError:
             continue
         clocks += [_clock_of(lag, camera[1]) for lag in audio_lags(sounds) if lag.fine or not clocks]
-        compared += 1
-        if compared == MAX_COMPARED:
+        if len(clocks) == MAX_HEARING:
             break
     if not clocks:
         return None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.errors import CalibrationError, ConfigError
+from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration import structure
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.solved import SolvedCalibration
@@ -242,12 +242,6 @@ def test_a_camera_that_is_far_off_is_named() -> None:
     away = perturbed(rig, degrees=25.0, percent=0.0)["cam03"]
     with pytest.raises(CalibrationError, match="agree with the given poses of 'cam03' to refine them"):
         refine(pictures, rig | {"cam03": away})
-
-
-def test_a_lens_that_cannot_be_refined_is_refused() -> None:
-    rig, pictures = filmed_room()
-    with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
-        refine(pictures, rig, lens="brown")
 
 
 @cache

@@ -27,10 +27,6 @@ def test_the_median_is_of_pairs_with_matches() -> None:
     assert report(None, None).median_epipolar_pixels is None
 
 
-def test_errors_are_the_findings_that_spoil_a_stream() -> None:
-    assert [finding.sentence for finding in report().errors] == ["Broken."]
-
-
 def test_a_report_is_plain_json() -> None:
     found = json.loads(json.dumps(report(None, 0.3).as_json()))
     assert found["median_epipolar_pixels"] == 0.3

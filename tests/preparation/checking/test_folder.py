@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.prepare import check_folder
 from tests.support.rooms import write_room
 
@@ -37,6 +37,15 @@ def test_a_folder_of_any_layout_is_checked_and_reported(tmp_path: Path) -> None:
     again = check_folder(tmp_path / "room", report=None)
     assert again.report.findings == checked.report.findings
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_report_that_cannot_be_written_is_noticed_first(tmp_path: Path) -> None:
+    write_room(tmp_path / "room")
+    (tmp_path / "file").write_text("")
+    noted = Noted()
+    with pytest.raises(StorageError, match="report of a check"):
+        check_folder(tmp_path / "room", report=tmp_path / "file" / "report", listener=noted)
+    assert noted.calls == ["begin check False"]
 
 
 def test_what_is_no_capture(tmp_path: Path) -> None:

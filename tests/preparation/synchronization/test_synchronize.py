@@ -46,9 +46,7 @@ def test_without_sound_motion_decides_and_says_why() -> None:
     errors = np.array([found.clocks[name].offset_seconds - CLOCKS[name].offset_seconds for name in VIEWS])
     assert np.abs(errors - errors.mean()).max() < 0.2 / 30
     # cam2 is 4.5 frames from cam0, which choosing frames cannot mend.
-    assert found.residual_seconds["cam2"] - found.residual_seconds["cam0"] == pytest.approx(1 / 60, abs=0.01) or any(
-        "off the common instants" in warning for warning in found.warnings
-    )
+    assert any("off the common instants" in warning for warning in found.warnings)
 
 
 def test_stamps_only_when_asked_for() -> None:
@@ -67,7 +65,7 @@ def test_cameras_that_one_signal_started() -> None:
 
 def test_problems_are_one_sentence_with_the_camera() -> None:
     still = MadeStreams(STAMPS, VIEWS, CLOCKS, still=frozenset({"cam1"}))
-    with pytest.raises(CaptureError, match=r"^Too little moves in the pictures of 'cam1'"):
+    with pytest.raises(CaptureError, match=r"^Too little moves in the pictures of 'cam1' .* move in the first 60 s"):
         synchronize(still, method="motion", cameras=lenses(VIEWS))
     with pytest.raises(CaptureError, match=r"Too little moves .* Nor can sound be used: Camera 'cam0' has no sound"):
         synchronize(still, cameras=lenses(VIEWS))

@@ -36,6 +36,18 @@ def test_all_rows_give_offset_rate_and_spread(tmp_path: Path) -> None:
     assert clocks["right"].clock.rate == 1
 
 
+@pytest.mark.parametrize(("rows", "rate"), [
+    ("right,0,12.03\nright,149,15.02", 1.0),
+    ("right,0,12\nright,149,14.99", 1.0),
+    ("right,0,12.000\nright,5,12.101", 1.0),
+    ("right,0,12.000\nright,149,15.000", 1.0067),
+])  # fmt: skip
+def test_what_rounding_explains_is_no_drift(tmp_path: Path, rows: str, rate: float) -> None:
+    found = read_timestamps(table(tmp_path, f"left,0,12\n{rows}"), STAMPS)
+    assert found["right"].clock.rate == pytest.approx(rate, abs=1e-3)
+    assert (found["right"].clock.rate == 1.0) == (rate == 1.0)
+
+
 def test_spaces_and_a_byte_order_mark_are_read(tmp_path: Path) -> None:
     file = tmp_path / "timestamps.csv"
     file.write_text("\ufeffcamera, frame, seconds\nleft, 0, 1\nright, 0, 2\n", encoding="utf-8")
@@ -56,6 +68,7 @@ def test_a_spreadsheet_with_decimal_commas(tmp_path: Path) -> None:
         ("left,-1,0\nright,0,0", None, r"frame -1 of camera 'left'"),
         ("left,0,0\nright,0,soon", None, r"Line 3 of .* is not a camera, a frame number and seconds"),
         ("left,0,nan\nright,0,0", None, r"Line 2"),
+        ("left,0,0,\nright,0,12,034", None, r"Line 3 of .* has more cells .* decimal points, or semicolons"),
         ("left,0,0\nleft,0,1\nright,0,0", None, r"two times for frame 0 of camera 'left'"),
         ("left,0", "camera,frame", r"lacks the column 'seconds'"),
         ("left,0,0\nleft,89,1.5\nright,0,0", None, r"runs 0.5056 times as fast"),

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair, connected_groups
-from structgstream.errors import CalibrationError, ConfigError
+from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.bundle import Limits, adjust_together, chosen
 from structgstream.preparation.calibration.colmap import MODELS, field_of_view, guessed_camera, holding, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
@@ -397,17 +397,12 @@ def refine(
     the given ones as they can.
 
     Args:
-        lens: the model of lenses whose distortion is estimated, too; by default the given distortion stays, and only
-            poses and focal lengths move.
+        lens: the model of lenses, not ``brown``, whose distortion is estimated, too; by default the given distortion
+            stays, and only poses and focal lengths move.
 
     Raises:
         CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
-        ConfigError: the model ``brown``.
     """
-    if lens == "brown":
-        raise ConfigError(
-            "Lenses of the model brown cannot be refined; take opencv, or leave the lens out to keep the given model."
-        )
     graph = posed_graph(pictures, cameras, slack_degrees=SLACK_DEGREES)
     _check_connected(cameras, graph)
     judging = _held_out(graph)

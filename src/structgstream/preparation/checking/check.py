@@ -99,11 +99,6 @@ class CheckReport:
     steps: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def errors(self) -> tuple[Finding, ...]:
-        """The findings that spoil a stream."""
-        return tuple(finding for finding in self.findings if finding.severity == "error")
-
-    @property
     def median_epipolar_pixels(self) -> float | None:
         """Median over pairs, or None without matches."""
         known = sorted(pair.epipolar_pixels for pair in self.pairs if pair.epipolar_pixels is not None)

@@ -49,7 +49,7 @@ def overlaps(pairs: Collection[Pair], names: Collection[str]) -> dict[str, int]:
 def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Finding]:
     """Cameras that see too little in common with others.
 
-    An error when no camera has matches; warnings where the cameras fall apart into groups, or one has few overlaps.
+    Warnings where no camera has matches, the cameras fall apart into groups, or one has few overlaps.
     """
     if not pairs:
         return [

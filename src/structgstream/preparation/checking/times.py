@@ -29,7 +29,6 @@ LESS_THAN_A_FRAME = (
     "starts have no such rest."
 )
 OFF_PERIODS = 0.25  # of a camera's frames, from which on it is off; true synchronous captures show up to 0.16
-OFF_SIGMAS = 3.0
 MAX_SIGMA_PERIODS = 1 / 3  # so that a whole frame shows
 FRAMES = 90  # that are compared
 MIN_FRAMES = 8
@@ -91,7 +90,7 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     judged = tuple(name for name in group if solution.sigmas[name] <= MAX_SIGMA_PERIODS * period)
     late = {name: solution.offsets[name] - middle for name in judged}
     errors = {name: solution.sigmas[name] for name in judged}
-    off = tuple(name for name in judged if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
+    off = tuple(name for name in judged if abs(late[name]) > max(OFF_PERIODS * period, SIGMAS * errors[name]))
     undecided = tuple(name for name in source.rig if name not in judged)
     return SynchronizationCheck(late, errors, off, undecided, period, lateness)
 
@@ -121,7 +120,8 @@ def _stated_lateness(source: FrameSource) -> dict[str, float]:
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
-    """An error for cameras that are off by a good part of a frame, a warning above 5 ms; a note if none can be judged.
+    """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on,
+    a note if none can be judged.
 
     Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
     between those of the others get one warning.

@@ -399,8 +399,9 @@ def _unconnected(others: Sequence[str], group: Sequence[str], seconds: float) ->
     rest = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
         f"What moves before {names} cannot be recognised in the motion before {rest}, so their clocks are not "
-        f"connected; the shortest take has {seconds:.1f} s: film ten seconds of motion that all see (a person who "
-        "walks and claps), give the calibration, or synchronise by audio or timestamps.csv."
+        f"connected. The beginnings of the takes were compared, {seconds:.1f} s of the shortest: film ten seconds of "
+        "motion there that all see (a person who walks and claps), give the calibration, or synchronise by audio or "
+        "timestamps.csv."
     )
 
 

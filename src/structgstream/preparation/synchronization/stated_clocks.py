@@ -3,7 +3,8 @@
 
 ``timestamps.csv`` states when frames were taken, by a clock that all cameras share: a header ``camera,frame,seconds``
 and a row for each frame that is known: the camera's name, the frame's number in its video counted from 0, and the
-second. One row a camera is enough (the frame of a clap, seconds 0); two or more that are apart give its rate, too.
+second. One row a camera is enough (the frame of a clap, seconds 0); two or more give its rate, too, where they are so
+far apart that rounding is no explanation.
 
 Most files' stamps start at 0 when a camera starts and share no clock, so stamps are trusted only on request. Timecode
 counts frames, so it is good to a frame; it starts again at midnight, so cameras lie within half a day of the first. A
@@ -16,6 +17,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,8 @@ COLUMNS = ("camera", "frame", "seconds")
 MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
 RATE_ROWS = 2
 MAX_DRIFT = 0.01
+MIN_DRIFT_SECONDS, MIN_DRIFT_UNITS = 1e-3, 2.0
+"""Between a camera's first and last row, the latter in units of the last decimal: less may be rounding, no drift."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, State
         CaptureError: the file cannot be read, lacks a camera or names a frame that its camera does not have, or its
             times do not follow the frames.
     """
-    rows = _rows(file)
+    rows, unit = _rows(file)
     clocks = {}
     for name, own in stamps.items():
         if name not in rows:
@@ -56,11 +60,13 @@ def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, State
                 f"{file} has no row for camera {name!r}; it has cameras {others}. Add a row of one of its frames, "
                 "or remove the camera."
             )
-        clocks[name] = _clock(file, name, rows[name], own)
+        clocks[name] = _clock(file, name, rows[name], own, least=max(MIN_DRIFT_SECONDS, MIN_DRIFT_UNITS * unit))
     return clocks
 
 
-def _rows(file: Path) -> dict[str, dict[int, float]]:
+def _rows(file: Path) -> tuple[dict[str, dict[int, float]], float]:
+    """The second of each frame of each camera, and that of the last decimal; writers leave out zeros, so it is that of
+    the row with most decimals."""
     try:
         lines = read_text(file).splitlines()
     except (OSError, Unreadable) as error:
@@ -76,7 +82,13 @@ def _rows(file: Path) -> dict[str, dict[int, float]]:
             f"{file} lacks the column {missing[0]!r}; its first line must name the columns {','.join(COLUMNS)}."
         )
     rows: dict[str, dict[int, float]] = {}
+    unit = 1.0
     for row in reader:
+        if any(row.get(None, ())):
+            raise CaptureError(
+                f"Line {reader.line_num} of {file} has more cells than its first line; write decimal points, or "
+                "semicolons between cells."
+            )
         try:
             name, frame, seconds = str(row["camera"]).strip(), whole(row["frame"]), number(row["seconds"])
         except Unreadable:
@@ -86,10 +98,12 @@ def _rows(file: Path) -> dict[str, dict[int, float]]:
         if frame in rows.setdefault(name, {}):
             raise CaptureError(f"{file} has two times for frame {frame} of camera {name!r}; keep one of them.")
         rows[name][frame] = seconds
-    return rows
+        unit = min(unit, 10.0 ** int(Decimal(row["seconds"].strip().replace(",", ".")).as_tuple().exponent))
+    return rows, unit
 
 
-def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> StatedClock:
+def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats, *, least: float) -> StatedClock:
+    """The clock by a camera's rows; a drift of less than ``least`` seconds from the first to the last is none."""
     frames = np.array(sorted(rows))
     seconds = np.array([rows[frame] for frame in frames.tolist()])
     if frames[0] < 0 or frames[-1] >= len(stamps):
@@ -102,8 +116,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
     rate = 1.0
     if len(frames) >= RATE_ROWS and own[-1] - own[0] > 0:
         rate = float(np.polyfit(own - own.mean(), seconds, 1)[0])
-        # What rounding of the rows could be is no drift.
-        if abs(rate - 1) * (own[-1] - own[0]) < 1e-3:
+        if abs(rate - 1) * (own[-1] - own[0]) < least:
             rate = 1.0
     if abs(rate - 1) > MAX_DRIFT:
         raise CaptureError(

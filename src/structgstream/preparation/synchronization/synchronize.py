@@ -49,7 +49,6 @@ class Synchronization:
     are of."""
     uncertainty_seconds: Mapping[str, float]
     """Camera to the standard error of its common times, relative to the mean of all cameras."""
-    residual_seconds: Mapping[str, float]  # see :func:`frame_residuals`
     method: str  # how they were found: ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
     reason: str  # why this method was chosen, a sentence
     warnings: tuple[str, ...]  # what the user should know, sentences
@@ -82,7 +81,7 @@ def synchronization(
             f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
         )
-    return Synchronization(clocks, uncertainties, residuals, method, reason, warnings)
+    return Synchronization(clocks, uncertainties, method, reason, warnings)
 
 
 def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
@@ -157,7 +156,7 @@ def synchronize(
         raise ConfigError(f"The method of synchronisation must be one of {', '.join(METHODS)}, got {method!r}.")
     if method == "csv" and timestamps is None:
         raise ConfigError(
-            "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds; give its path."
+            "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds beside the videos."
         )
     stamps = {name: np.asarray(footage.stamps(name), np.float64) for name in footage.cameras}
     for name, own in stamps.items():
@@ -265,7 +264,7 @@ def require_motion(changes: Mapping[str, Changes]) -> None:
     if still:
         raise CaptureError(
             f"Too little moves in the pictures of {', '.join(repr(name) for name in still)} to synchronise by "
-            "motion; film people who move, a clap for audio, or give timestamps.csv."
+            f"motion; film people who move in the first {MOTION_SECONDS:g} s, a clap for audio, or give timestamps.csv."
         )
 
 
