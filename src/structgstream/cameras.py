@@ -214,6 +214,10 @@ class Similarity:
         return rig.mapped({name: self.camera(rig[name]) for name in rig})
 
 
+NEAR_IN_RIG_RADII = 0.12
+"""Of the near plane by default. Cameras of a dome stand in the wall that the others see: it must not be drawn."""
+
+
 def rig_radius(rig: CameraRig) -> float:
     """Largest distance of a training camera to the mean training-camera position, in the capture's units."""
     centers = torch.stack([rig[name].center for name in rig.training])

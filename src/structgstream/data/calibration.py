@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import from_numpy
 
-from structgstream.cameras import Camera, CameraRig, rig_radius
+from structgstream.cameras import NEAR_IN_RIG_RADII, Camera, CameraRig, rig_radius
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.data.text_files import BROKEN, Unreadable, number, readable, reason
 from structgstream.errors import CalibrationError, CaptureError
@@ -85,9 +85,6 @@ def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> NDArray[np.float64]:
     """The matrix ``[3, 3]`` of focal lengths and principal point, pixels."""
     fx, fy, cx, cy = map(number, (fx, fy, cx, cy))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-
-
-NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others see: it must not be drawn
 
 
 def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path) -> Camera:

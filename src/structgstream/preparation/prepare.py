@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.atomic_files import atomic_file
-from structgstream.cameras import CameraRig, rig_radius
-from structgstream.data.calibration import NEAR_IN_RIG_RADII, Calibration, listed
+from structgstream.cameras import NEAR_IN_RIG_RADII, CameraRig, rig_radius
+from structgstream.data.calibration import Calibration, listed
 from structgstream.data.camera_files import REPORT
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import best_surrounded, open_capture

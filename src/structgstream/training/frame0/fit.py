@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, rig_radius
 from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.scene.sampling import RigSampling
@@ -126,9 +126,8 @@ def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[Pa
 
 
 def rig_extent(rig: CameraRig) -> float:
-    """1.1 times the largest distance of a camera to the mean position: the unit of Scaffold-GS's offset rate."""
-    centers = torch.stack([rig[name].center for name in rig.training])
-    return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+    """1.1 rig radii: the unit of Scaffold-GS's offset rate."""
+    return 1.1 * rig_radius(rig)
 
 
 @dataclass

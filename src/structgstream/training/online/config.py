@@ -4,6 +4,7 @@
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
+from structgstream.cameras import NEAR_IN_RIG_RADII
 from structgstream.errors import ConfigError
 from structgstream.scene.state import (
     PAPER_DYNAMIC,
@@ -87,7 +88,7 @@ class SpawnRules:
     pixel_step: int = 2
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
-    """Number of depths of a ray that begins ``NEAR`` in front of its camera; of a nearer one in proportion more."""
+    """Number of depths of a ray that begins at the default near plane; of one that begins nearer in proportion more."""
     min_supports: int = 2
     """Least number of other views that support a point: there a missing pixel lies at its projection."""
     max_contradictions: float = 0.34
@@ -111,14 +112,12 @@ class SpawnRules:
     outlier_views: int = 2
     """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
 
-    NEAR: ClassVar[float] = 0.12
-    """Rig radii."""
     MAX_PLANES: ClassVar[int] = 384
 
     def planes_of(self, near: float) -> int:
         """Number of depths of the rays of a camera with its near plane at ``near`` rig radii. They are even in inverse
         depth, so that their distance, in pixels of disparity, is the same for every near plane."""
-        return min(round(self.planes * max(1.0, self.NEAR / near)), self.MAX_PLANES)
+        return min(round(self.planes * max(1.0, NEAR_IN_RIG_RADII / near)), self.MAX_PLANES)
 
 
 @dataclass(frozen=True)
