@@ -164,6 +164,14 @@ def test_the_rate_that_is_asked_for_thins_out(tmp_path: Path) -> None:
     assert [row[0][1] for row in all_numbers(source.frames())] == [0, 2, 4, 6, 8]
 
 
+def test_a_rounded_rate_leaves_no_instant_without_pictures() -> None:
+    stamps = tuple(round(frame * 1001 / 30000 * 90000) for frame in range(600))
+    tracks = {name: VideoTrack(Path(f"{name}.mp4"), stamps, 1 / 90000, 64, 48) for name in RIG}
+    source = synchronised(tracks, RIG, where=Path("capture"), fps=30)
+    assert (len(source), source.fps) == (600, 30000 / 1001)
+    assert all(None not in own for own in source.stamps.values())
+
+
 def test_a_variable_rate_is_taken_by_time(tmp_path: Path) -> None:
     """A phone that leaves out frames and whose frames come a little early or late."""
     write_videos(tmp_path, list(RIG), frames=12)

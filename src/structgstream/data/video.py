@@ -134,9 +134,10 @@ def synchronised(
     Args:
         tracks: camera name to its video.
         where: the capture, for messages and for its name.
-        fps: frames a second; measured from the time stamps when None.
-        clocks: camera name to its clock; None if time stamps are of one clock, are taken at the rate ``fps`` if that
-            is given, and no camera has two frames for one instant.
+        fps: frames a second of the instants; measured from the time stamps when None. Without clocks it is only
+            compared with those, since instants at a rounded rate would miss frames.
+        clocks: camera name to its clock; None if time stamps are of one clock, and no camera has two frames for one
+            instant.
 
     Raises:
         CalibrationError: a video's size is not the size that its camera's intrinsics are for.
@@ -158,7 +159,8 @@ def synchronised(
             f"{where} states {fps:g} frames a second, the time stamps of its videos say {measured:g}; "
             "correct the number."
         )
-    rate = fps or measured or 30.0  # one frame per camera: any rate is right
+    # Of one frame per camera any rate is right.
+    rate = fps if fps and clocks is not None else measured or fps or 30.0
     positions = {name: times[name] * rate for name in rig}
     origin = origin_of(list(positions.values()))
     placed = {name: place(own - origin) for name, own in positions.items()}
