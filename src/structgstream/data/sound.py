@@ -203,6 +203,7 @@ class FileFeed:
         self._source = source
         self._packets = self._encoded()
         self._next: OpusPacket | None = None
+        self._end: float | None = None  # presentation time at which the packets that were taken end
         self._reported = False
 
     def until(self, seconds: float) -> list[OpusPacket]:
@@ -213,13 +214,13 @@ class FileFeed:
             if packet.seconds >= seconds:
                 return found
             found.append(packet)
+            self._end = packet.seconds + PACKET_SECONDS
         self._next = None
-        if not self._reported and (not found or found[-1].seconds + 2 * PACKET_SECONDS < seconds):
+        if not self._reported and (self._end is None or self._end + PACKET_SECONDS < seconds):
             self._reported = True
-            end = found[-1].seconds + PACKET_SECONDS if found else None
             log.warning(
-                "The sound of %s ends %s; what follows is silent",
-                self._source.name, "before these frames" if end is None else f"at {end:.1f} s, before the pictures",
+                "The sound of %s ends %s; what follows is silent", self._source.name,
+                "before these frames" if self._end is None else f"at {self._end:.1f} s, before the pictures",
             )  # fmt: skip
         return found
 
@@ -370,10 +371,10 @@ def read_audio(path: Path, *, rate: int = SAMPLE_RATE) -> NDArray[np.float32] | 
                     start_seconds = 0.0 if frame.time is None else float(frame.time)
                 parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(frame)]
             parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(None)]
-        except av.error.FFmpegError as error:
+        except (av.error.FFmpegError, ValueError) as error:  # The latter where channels or rate change.
             raise CaptureError(
-                f"The sound of {path} cannot be decoded ({error.strerror}); copy the file again, or synchronise by "
-                "another method."
+                f"The sound of {path} cannot be decoded ({getattr(error, 'strerror', error)}); copy the file "
+                "again, or synchronise by another method."
             ) from None
     if not parts or start_seconds is None:
         return None
