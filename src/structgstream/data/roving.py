@@ -169,10 +169,10 @@ def frame_points(
     is added, which is too large, and harms where there are matches.
     """
     config, roving = config or PointsConfig(), roving_of(source)
-    found = initial_points(frame, source.rig, config=config, seed=seed).positions
+    found = initial_points(frame, source.rig, config=config, seed=seed)
     if roving is None or frame.index > 0:
         return found
-    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
+    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed)
     moving, hull = found[roving.moving(found, frame)], roving.hull(frame)
     lacking = len(moving) < MATCHED_SHARE * len(hull)
     _log.info("Of what moves %d points were matched; %d of its hull are added", len(moving), lacking * len(hull))
