@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper
+from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, innermost
 from structgstream.data.timeline import Clock
 from structgstream.data.video import VideoSource
 from structgstream.data.video_index import load_av
@@ -304,9 +304,8 @@ def start_seconds(source: FrameSource) -> float:
 
 def camera_videos(source: FrameSource) -> dict[str, Path]:
     """The videos of a capture's cameras, by name; nothing for pictures."""
-    while isinstance(source, SourceWrapper):
-        source = source.source
-    return {name: track.path for name, track in source.tracks.items()} if isinstance(source, VideoSource) else {}
+    inner = innermost(source)
+    return {name: track.path for name, track in inner.tracks.items()} if isinstance(inner, VideoSource) else {}
 
 
 class SoundDecoder:
