@@ -24,7 +24,7 @@ def contestants(*, iterations: int, scale: float, points: int) -> list[Contestan
     source = resized(bundled_clip(), scale)
     frame = next(iter(source.frames()))
     similarity = normalizing_similarity(source.rig, radius=TINY.NORMALISED_RADIUS)
-    made = initial_points(frame, source.rig, config=replace(FAST.points, max_points=points), seed=0).positions
+    made = initial_points(frame, source.rig, config=replace(FAST.points, max_points=points), seed=0)
     # The tiny schedule stretched: a fixed share of the iterations on small pictures and before each growth.
     stretch = iterations / TINY.initial.iterations
     growth = TINY.initial.growth

@@ -75,7 +75,7 @@ def write_exact(
     written = replace(content, cameras=exact, points=None)
     write_prepared(folder, written)
     source = open_prepared(folder)
-    np.save(folder / SEED_POINTS, initial_points(next(source.frames(0)), source.rig).positions)
+    np.save(folder / SEED_POINTS, initial_points(next(source.frames(0)), source.rig))
     write_prepared(folder, replace(written, points=SEED_POINTS))
 
 

@@ -15,21 +15,22 @@ from tests.support.captures import write_video
 RATE = 48_000
 
 
-def with_sound(path: Path, *, start: float = 0.0, rate: int = RATE, seconds: float = 1.0) -> Path:
+def with_sound(path: Path, *, start: float = 0.0, rate: int = RATE, seconds: float = 1.0, layout: str = "mono") -> Path:
     """A video whose sound, a click in its middle, begins at ``start`` seconds."""
     samples = np.zeros(round(rate * seconds), np.float32)
     samples[len(samples) // 2] = 0.9
     with av.open(str(path), "w") as container:
         video = container.add_stream("mpeg4", rate=30)
         video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
-        sound = container.add_stream("pcm_f32le", rate=rate)
-        sound.layout = "mono"
+        sound = container.add_stream("aac" if path.suffix == ".ts" else "pcm_f32le", rate=rate)
+        sound.layout = layout
         for index in range(5):
             picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
             picture.pts = index
             container.mux(video.encode(picture))
         container.mux(video.encode(None))
-        frame = av.AudioFrame.from_ndarray(samples[None], format="flt", layout="mono")
+        stored = np.repeat(samples, 1 if layout == "mono" else 2)[None]
+        frame = av.AudioFrame.from_ndarray(stored, format="flt", layout=layout)
         frame.sample_rate, frame.pts = rate, round(start * rate)
         container.mux(sound.encode(frame))
         container.mux(sound.encode(None))
@@ -67,3 +68,11 @@ def test_what_is_no_video(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_text("no video")
     with pytest.raises(CaptureError, match=r"sound of .*a\.mp4 cannot be read"):
         read_audio(tmp_path / "a.mp4")
+
+
+def test_sound_whose_channels_change(tmp_path: Path) -> None:
+    """As recordings of broadcasts have it."""
+    parts = [with_sound(tmp_path / f"{layout}.ts", layout=layout).read_bytes() for layout in ("mono", "stereo")]
+    (tmp_path / "a.ts").write_bytes(b"".join(parts))
+    with pytest.raises(CaptureError, match=r"sound of .*a\.ts cannot be decoded \(Frame does not match"):
+        read_audio(tmp_path / "a.ts")

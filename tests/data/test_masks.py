@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unicodedata import normalize
 
 import cv2
 import numpy as np
@@ -18,7 +19,19 @@ from structgstream.data.source import every_nth_frame
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import Undistortion, rectilinear, undistort
 from structgstream.errors import CaptureError
-from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
+from tests.data.test_transforms_capture import edit
+from tests.data.test_transforms_capture import write as write_transforms
+from tests.support.captures import (
+    HEIGHT,
+    WIDTH,
+    picture,
+    small_rig,
+    write_clip,
+    write_panoptic,
+    write_picture,
+    write_video,
+    write_videos,
+)
 
 Mask = NDArray[np.bool_]
 
@@ -62,6 +75,44 @@ def test_masks_of_videos_are_numbered_and_follow_sections_and_sizes(tmp_path: Pa
     expected[5, 5] = False  # one of its four pixels is left out
     np.testing.assert_array_equal(frame.masks["cam01"], expected)
     assert [list(frame.masks) for frame in every_nth_frame(whole, 3).frames()] == [[], ["cam01"]]
+
+
+def test_masks_of_a_video_are_numbered_as_its_own_frames(tmp_path: Path) -> None:
+    rig = write_clip(tmp_path, frames=4)
+    write_videos(tmp_path, list(rig), frames=6)
+    write_video(tmp_path / "cam01.mp4", [picture(1, frame) for frame in range(2, 6)], instants=range(2, 6))
+    for name in rig:
+        write_mask(tmp_path / f"masks/{name}/3.png", left_half())
+    (tmp_path / "cameras.json").write_text(
+        (tmp_path / "cameras.json").read_text().replace('"frames": 6', '"frames": 4')
+    )
+    frames = list(open_capture(tmp_path).frames())  # from the instant 2 on
+    assert [list(frame.masks) for frame in frames] == [[], ["cam00", "cam02", "cam03"], [], ["cam01"]]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "timed"), [("images/CAM/FRAME.png", True), ("images/CAM/FRAME.png", False), ("FRAME/CAM.png", False)]
+)
+def test_masks_are_named_as_the_camera_s_own_pictures(tmp_path: Path, pattern: str, timed: bool) -> None:
+    """Not by their times, nor as those of a camera with other padding; pictures of one name are of their folders."""
+    write_transforms(tmp_path, pattern, w=WIDTH, h=HEIGHT)
+    if not timed:
+        edit(tmp_path / "transforms.json", lambda content: [frame.pop("time") for frame in content["frames"]])
+        for file in (tmp_path / "images/cam02").glob("*.png"):
+            file.rename(file.with_stem(f"00{file.stem}"))
+    write_mask(tmp_path / "masks/cam00/0001.png", left_half())
+    assert [list(frame.masks) for frame in open_capture(tmp_path).frames()] == [[], ["cam00"], []]
+
+
+def test_a_decomposed_name_of_a_camera(tmp_path: Path) -> None:
+    """As archives of macOS have it."""
+    write_clip(tmp_path, frames=2)
+    file, name = tmp_path / "cameras.json", normalize("NFD", "süd")
+    file.write_text(file.read_text().replace("cam02", "süd"))
+    (tmp_path / "cam02.mp4").rename(tmp_path / f"{name}.mp4")
+    write_mask(tmp_path / f"masks/{name}.png", left_half())
+    write_mask(tmp_path / f"masks/{name}/1.png", left_half(HEIGHT, WIDTH).T)
+    assert [(~frame.masks["süd"]).mean() for frame in open_capture(tmp_path).frames()] == [0.5, 0.75]
 
 
 def test_a_mask_with_another_spelling_of_png_counts(tmp_path: Path) -> None:

@@ -166,3 +166,10 @@ def test_decoded_pictures(tmp_path: Path) -> None:
     source = open_n3dv(tmp_path)
     assert (source.rig.testing, len(source)) == (("cam00",), 2)
     assert all_numbers(source.frames(1)) == [[(camera, 1) for camera in range(4)]]
+
+
+def test_pictures_of_the_held_out_camera_alone(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", np.array([[0, 1, 0, 0, 48, 1, 0, 0, 0, 64, 0, 0, -1, 0, 60, 1, 10]], float))
+    write_picture(tmp_path / "cam00/images/0000.png", picture(0, 0))
+    with pytest.raises(CalibrationError, match=r"at least two training cameras, got 0 \(1 in the capture, 1 held out"):
+        open_n3dv(tmp_path)

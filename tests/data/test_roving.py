@@ -3,7 +3,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -160,7 +159,7 @@ def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull_if_these
     moving, still, behind = np.array([[0.0, 0.0, 0.0]]), np.array([[0.5, 0.5, 0.5]]), np.array([[0.1, 0.2, 3.0]])
 
     def found(frame: MultiViewFrame, rig: CameraRig, **options: Any) -> Any:
-        return SimpleNamespace(positions=behind if "roving/0" in rig.cameras else np.concatenate([moving, still]))
+        return behind if "roving/0" in rig.cameras else np.concatenate([moving, still])
 
     monkeypatch.setattr(roving_module, "initial_points", found)
     monkeypatch.setattr(WithRoving, "moving", lambda self, points, frame: (points == 0).all(1))

@@ -78,9 +78,11 @@ def test_a_gap_in_the_time_stamps_is_silence_and_what_comes_twice_is_left_out() 
     assert packets_heard(packets) == pytest.approx([0.05, 0.55, 1.05], abs=MILLISECOND)
 
 
-def test_a_shorter_sound_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("first", [1.0, 0.51])
+def test_a_shorter_sound_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, first: float) -> None:
+    """Also where the frame that asks for the last packet ends with them."""
     feed = SoundFile("cam", write_sound(tmp_path / "a.wav", claps(0.5, 0.2)), Clock()).open()
-    assert len(feed.until(1.0)) == 26
+    assert len(feed.until(first)) == 26
     assert feed.until(2.0) == feed.until(3.0) == []
     assert [record.message for record in caplog.records] == [
         "The sound of cam ends at 0.5 s, before the pictures; what follows is silent"

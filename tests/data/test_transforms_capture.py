@@ -63,12 +63,14 @@ def test_a_rate_that_is_none(tmp_path: Path, fps: object) -> None:
         open_capture(tmp_path)
 
 
-def test_times_order_the_pictures_not_their_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize("last", [1.0, 0.5, -10.0])
+def test_times_order_the_pictures_not_their_names(tmp_path: Path, last: float) -> None:
+    """Negative ones too, as of takes that are counted from their middle."""
     write(tmp_path, "rgb/CAM/FRAME.png")
 
     def backwards(content: dict) -> None:
         for entry in content["frames"]:
-            entry["time"] = 1 - entry["time"]
+            entry["time"] = last - entry["time"]
 
     edit(tmp_path / "transforms.json", backwards)
     expected = [[(camera, frame) for camera in range(3)] for frame in reversed(range(FRAMES))]

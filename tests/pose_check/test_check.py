@@ -106,11 +106,11 @@ def clip_frame() -> MultiViewFrame:
     return next(iter(CLIP.frames()))
 
 
-def test_right_poses_pass_with_room_to_spare(clip_frame: MultiViewFrame) -> None:
+def test_right_poses_pass_with_room_to_spare(clip_frame: MultiViewFrame, caplog: pytest.LogCaptureFixture) -> None:
     check = check_poses(clip_frame, CLIP.rig)
     assert check.conclusive
     assert check.share_violating < 0.1
-    assert not check.findings
+    assert not caplog.text
 
 
 def changed(rig: CameraRig, change: Callable[[torch.Tensor], torch.Tensor]) -> CameraRig:
@@ -172,8 +172,8 @@ def permuted(rig: CameraRig, names: list[str]) -> CameraRig:
 def test_exchanged_cameras_are_named(
     clip_frame: MultiViewFrame, wrong: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    check = check_poses(clip_frame, permuted(CLIP.rig, wrong))
-    assert sorted(check.off) == wrong
+    check_poses(clip_frame, permuted(CLIP.rig, wrong))
+    assert [name for name in CLIP.rig if repr(name) in caplog.text] == wrong
     assert f"Names of cameras are exchanged: the pictures of {wrong[0]!r}" in caplog.text or (
         f"The names of cameras {wrong[0]!r} and {wrong[1]!r} are exchanged" in caplog.text
     )
@@ -187,7 +187,6 @@ def test_wrong_matches_of_cameras_far_apart_accuse_nobody(caplog: pytest.LogCapt
     frame = next(iter(throw.frames()))
     check = check_poses(replace(frame, images={name: frame.images[name] for name in rig}), rig)
     assert check.conclusive
-    assert not check.off
     assert not caplog.text
 
 
@@ -197,5 +196,6 @@ def test_a_third_of_a_rig_is_never_permuted_silently(
     training = list(CLIP.rig.training)
     for seed in range(3):
         wrong = [training[place] for place in np.random.default_rng(seed).permutation(len(training))[:3]]
-        assert check_poses(clip_frame, permuted(CLIP.rig, wrong)).off
-    caplog.clear()
+        check_poses(clip_frame, permuted(CLIP.rig, wrong))
+        assert all(repr(name) in caplog.text for name in wrong)
+        caplog.clear()

@@ -2,7 +2,7 @@
 """Writes tiny captures in every layout; each picture carries its camera's and its frame's number."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -68,13 +68,14 @@ def write_video(
     matrix: int | None = 1,
     color_range: int | None = LIMITED,
     pixels: str = "yuv444p",
+    options: Mapping[str, str] | None = None,
 ) -> None:
-    """A lossless H.264 file with B-frames and short groups; ``instants`` are times in frames."""
+    """A lossless H.264 file with short groups; ``instants`` are times in frames, ``options`` of libx264."""
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = pictures[0].shape[:2]
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
-        options = {"qp": "0", "g": "4", "bf": "2", "preset": "fast", "threads": "1"}
-        stream = container.add_stream("libx264", rate=round(fps), options=options)
+        own = {"qp": "0", "g": "4", "bf": "2", "preset": "fast", "threads": "1", **(options or {})}
+        stream = container.add_stream("libx264", rate=round(fps), options=own)
         stream.width, stream.height, stream.pix_fmt = width, height, pixels
         stream.codec_context.time_base = Fraction(1, TICKS)
         if matrix is not None:

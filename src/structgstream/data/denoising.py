@@ -11,7 +11,7 @@ frame of a group that is fitted separately. For later frames it gained nothing (
 """
 
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import enlargement
 from structgstream.data.images import opencv
-from structgstream.data.source import FrameStream, SourceWrapper, is_recording
+from structgstream.data.source import FrameStream, SourceWrapper, closed, is_recording
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
@@ -56,8 +56,8 @@ class Denoised(SourceWrapper):
     at: tuple[int, ...]
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        with ExitStack() as stack:
-            for frame in _closed(stack, self.source.frames(start)):
+        with closed(self.source.frames(start)) as frames:
+            for frame in frames:
                 yield self._mean(frame) if frame.index in self.at else frame
 
     def _mean(self, frame: MultiViewFrame) -> MultiViewFrame:
@@ -66,7 +66,7 @@ class Denoised(SourceWrapper):
             following = frame.index + 1
             own = self.source.frames(following) if following < len(self.source) else iter(())
             after = self.source.frames_after() if isinstance(self.source, SourceWrapper) else iter(())
-            later = chain(_closed(stack, own), _closed(stack, after))
+            later = chain(stack.enter_context(closed(own)), stack.enter_context(closed(after)))
 
             def readable() -> Iterator[MultiViewFrame]:  # what cannot be read raises when it is reached itself
                 with suppress(CaptureError):
@@ -144,10 +144,3 @@ def _box_sums(values: Any) -> Any:
     """Sums over the squares of SMOOTHING_PIXELS around each pixel, float32."""
     cv2 = opencv()
     return cv2.boxFilter(values, cv2.CV_32F, (SMOOTHING_PIXELS, SMOOTHING_PIXELS), normalize=False)
-
-
-def _closed(stack: ExitStack, frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
-    """``frames``, which may hold a thread or a decoder, closed with ``stack``."""
-    if hasattr(frames, "close"):
-        stack.enter_context(closing(frames))  # type: ignore[type-var]
-    return frames

@@ -4,10 +4,11 @@
 ::
 
     masks/CAMERA.png          for all frames
-    masks/CAMERA/FRAME.png    for one; FRAME is the name of the frame's pictures, of videos its number from 0
+    masks/CAMERA/FRAME.png    for one; FRAME is the name of the camera's picture (of the folder where there is one for
+                              each frame), of a video the frame's number in it, from 0
 
-They have the size of the pictures or videos as stored (before undistortion). Where a camera has both, both hold. One
-that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
+They are of the pictures or videos as they are shown, turned where those are, before undistortion. Where a camera has
+both, both hold. One that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
 """
 
 import logging
@@ -22,11 +23,12 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
-from structgstream.data.camera_files import by_stem, is_hidden
+from structgstream.data.camera_files import by_stem, is_hidden, name_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
 from structgstream.data.source import FrameSource, SourceWrapper, innermost, resized_to
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import UndistortedSource, lenses_of
+from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 
@@ -40,7 +42,7 @@ Mask = NDArray[np.bool_]
 class CameraMasks:
     """The mask files of one camera."""
 
-    size: tuple[int, int]  # width and height of its stored pictures
+    size: tuple[int, int]  # width and height of its pictures before undistortion
     always: Path | None  # for all frames, or None
     frames: Mapping[int, Path]  # by frame number, for one
 
@@ -99,7 +101,7 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     if picture.shape[1::-1] != size:
         raise CaptureError(
             f"The mask {file} has {picture.shape[1]}x{picture.shape[0]} pixels, the pictures of camera {camera!r} have "
-            f"{size[0]}x{size[1]}; a mask is of the stored picture's size."
+            f"{size[0]}x{size[1]}; a mask is of the picture as it is shown, before undistortion."
         )
     return picture.any(axis=2)
 
@@ -110,7 +112,8 @@ def with_masks(source: FrameSource, folder: Path) -> FrameSource:
     entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
     if not entries:
         return source
-    names = {entry.name if entry.is_dir() else entry.stem: entry for entry in entries}
+    names = {name_of(entry): entry for entry in entries}
+    folders = {name_of(entry): entry for entry in entries if entry.is_dir()}
     for name, entry in names.items():
         if name not in source.rig.cameras:
             raise CaptureError(
@@ -119,7 +122,8 @@ def with_masks(source: FrameSource, folder: Path) -> FrameSource:
             )
 
     def masked(stored: FrameSource) -> FrameSource:
-        return MaskedSource(stored, {name: _files(folder, name, stored) for name in stored.rig if name in names})
+        files = {name: _files(folder, name, stored, folders.get(name)) for name in stored.rig if name in names}
+        return MaskedSource(stored, files)
 
     log.warning("%s: what is black in the masks of %s does not count", source.name, listed(names))
     return _below_lenses(source, masked)
@@ -145,19 +149,16 @@ def _is_mask(file: Path) -> bool:
     return suffix == ".png"
 
 
-def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
-    """The mask files of a camera, the first of which is checked."""
-    always, own = by_stem(_masks(folder)).get(name), folder / name
-    files = by_stem(_masks(own)) if own.is_dir() else {}
-    inner, instants = innermost(source), ()
-    if isinstance(inner, ImageSource):  # frames of videos have no names
-        instants = inner.instants or tuple("" if file is None else file.stem for file in inner.files[name])
-    numbers = {instant: index for index, instant in enumerate(instants or map(str, range(len(source))))}
-    if not instants:
+def _files(folder: Path, name: str, source: FrameSource, own: Path | None) -> CameraMasks:
+    """The mask files of a camera, the first of which is checked; those of single frames lie in ``own``."""
+    always, files = by_stem(_masks(folder)).get(name), {} if own is None else by_stem(_masks(own))
+    numbers = _frame_numbers(source, name) if files else {}
+    is_named = isinstance(innermost(source), ImageSource)  # frames of videos have no names
+    if not is_named:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
     if files and not frames:
-        expected = f"{next(filter(None, instants))}.png" if instants else "000000.png, the frame's number from 0"
+        expected = f"{next(iter(numbers))}.png" if is_named else "000000.png, the frame's number in the video, from 0"
         raise CaptureError(
             f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
             f"expected names such as {expected}."
@@ -167,3 +168,17 @@ def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
     for file in filter(None, (masks.always, next(iter(frames.values()), None))):
         read_mask(file, size=size, camera=name)
     return masks
+
+
+def _frame_numbers(source: FrameSource, name: str) -> dict[str, int]:
+    """The frames of a camera by the names of their masks."""
+    inner = innermost(source)
+    if isinstance(inner, VideoSource):
+        own = {stamp: str(number) for number, stamp in enumerate(inner.tracks[name].stamps)}
+        return {own[stamp]: index for index, stamp in enumerate(inner.stamps[name]) if stamp is not None}
+    if not isinstance(inner, ImageSource):
+        return {str(index): index for index in range(len(source))}
+    stems = {index: name_of(file) for index, file in enumerate(inner.files[name]) if file is not None}
+    if inner.instants and not 1 < len({*stems.values()}) == len(stems):  # a folder for each frame
+        return {instant: index for index, instant in enumerate(inner.instants)}
+    return {stem: index for index, stem in stems.items()}

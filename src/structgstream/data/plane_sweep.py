@@ -90,14 +90,13 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class SweepView:
-    """A picture ready for the sweep: reduced camera, grey ``[H, W]`` in [0, 1] and colours ``[H, W, 3]``.
+    """A picture ready for the sweep: reduced camera and grey ``[H, W]`` in [0, 1].
 
     ``mask`` ``[H, W]`` has the pixels that may get a depth; None for all.
     """
 
     camera: Camera
     grey: FloatImage
-    colors: NDArray[np.uint8]
     mask: NDArray[np.bool_] | None = None
 
 
@@ -108,10 +107,10 @@ def sweep_view(
     cv2 = opencv()
     width = min(width, camera.width)
     height = max(1, round(camera.height * width / camera.width))
-    colors = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    grey = cv2.cvtColor(colors.astype(np.float32) / 255, cv2.COLOR_RGB2GRAY)
+    reduced = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    grey = cv2.cvtColor(reduced.astype(np.float32) / 255, cv2.COLOR_RGB2GRAY)
     mask = None if mask is None else reduced_mask(mask, (width, height))
-    return SweepView(camera.resized(width, height), np.asarray(grey, np.float32), colors, mask)
+    return SweepView(camera.resized(width, height), np.asarray(grey, np.float32), mask)
 
 
 def sweep_depth(
@@ -172,9 +171,9 @@ def sweep_points(
     bounds: Mapping[str, SweepBounds],
     workers: int,
     levels: Sequence[SweepConfig],
-) -> tuple[Floats, NDArray[np.uint8]]:
-    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8, of whose
-    pixels ``masks`` ``[H, W]`` leave some out.
+) -> Floats:
+    """Consistent points ``[P, 3]`` from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8, of whose pixels
+    ``masks`` ``[H, W]`` leave some out.
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
@@ -182,7 +181,6 @@ def sweep_points(
     cv2 = opencv()
     names = [name for name in cameras if neighbours[name]]
     positions: list[Floats] = [np.empty((0, 3))]
-    colors: list[NDArray[np.uint8]] = [np.empty((0, 3), np.uint8)]
     covered: dict[str, FloatImage] = {}
     with ThreadPoolExecutor(workers) as pool:
         for config in levels:
@@ -210,9 +208,8 @@ def sweep_points(
                 reach = config.window // 2 | 1
                 blank = cv2.boxFilter(before, -1, (reach, reach)) < 0.02
                 positions.append(points[blank[mask]])
-                colors.append(views[name].colors[mask & blank])
                 covered[name] = np.maximum(before, mask)
-    return np.concatenate(positions), np.concatenate(colors)
+    return np.concatenate(positions)
 
 
 def _agreement(

@@ -74,26 +74,14 @@ class PointsConfig:
     """The plane sweeps, fine to coarse; empty for none."""
 
 
-@dataclass(frozen=True)
-class InitialPoints:
-    """Points to start the first frame from."""
-
-    positions: Floats  # ``[P, 3]`` float64, in the capture's units
-    colors: NDArray[np.uint8]  # ``[P, 3]`` uint8 sRGB
-    counts: Mapping[str, int]  # number of points from ``"sift"``, ``"sweep"`` and ``"random"``
-
-    @property
-    def random(self) -> bool:
-        """Whether the points are random, because too few were found."""
-        return self.counts.get("random", 0) > 0
-
-
 def initial_points(
     frame: MultiViewFrame, rig: CameraRig, *, config: PointsConfig = PointsConfig(), seed: int = 0
-) -> InitialPoints:
-    """Points of one frame from the training cameras' pictures and poses; held-out pictures are never read.
+) -> Floats:
+    """Points ``[P, 3]`` to start the first frame from, in the capture's units, of the training cameras' pictures and
+    poses; held-out pictures are never read.
 
-    Absent cameras and pixels that do not count give no points.
+    Absent cameras and pixels that do not count give no points. Where too few are found, random ones replace them, with
+    a warning.
 
     The result does not depend on the number of threads; ``seed`` is used for random points only.
     """
@@ -102,17 +90,15 @@ def initial_points(
     distance = viewing_distance(cameras)
     neighbours = neighbor_views(cameras, count=config.NEIGHBOURS, distance=distance)
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
-    positions, colors = _sift_points(
+    positions = _sift_points(
         *_at_reference(cameras, images, masks), neighbours, distance=distance, workers=workers, config=config
     )
-    sources = np.zeros(len(positions), np.uint8)
     if config.SWEEP_LEVELS:
         bounds = _sweep_bounds(cameras, positions, distance=distance, config=config)
-        swept, swept_colors = sweep_points(
+        swept = sweep_points(
             cameras, images, masks, neighbours=neighbours, bounds=bounds, workers=workers, levels=config.SWEEP_LEVELS
         )
-        positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
-        sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
+        positions = np.concatenate([positions, swept])
     selected = np.flatnonzero(_has_neighbors(positions, cell=config.ISOLATION_SHARE * distance))
     selected = selected[_thin_out(positions[selected], cell=config.CELL_SHARE * distance, count=config.max_points)]
     if len(selected) < config.MIN_POINTS:
@@ -121,12 +107,8 @@ def initial_points(
             "starting from %d random points in the volume that the cameras see: expect a worse result.",
             len(selected), frame.index, config.RANDOM_POINTS,
         )  # fmt: skip
-        positions, colors = _random_points(
-            cameras, images, masks=masks, distance=distance, rng=np.random.default_rng(seed), config=config
-        )
-        return InitialPoints(positions, colors, {"random": len(positions)})
-    counts = {"sift": int((sources[selected] == 0).sum()), "sweep": int((sources[selected] == 1).sum())}
-    return InitialPoints(positions[selected], colors[selected], counts)
+        return _random_points(cameras, masks, distance=distance, rng=np.random.default_rng(seed), config=config)
+    return positions[selected]
 
 
 def _at_reference(
@@ -156,7 +138,7 @@ def _sift_points(
     distance: float,
     workers: int,
     config: PointsConfig,
-) -> tuple[Floats, NDArray[np.uint8]]:
+) -> Floats:
     """Triangulated keypoints that a third view confirms."""
     pairs = unique_pairs(neighbours)
     with ThreadPoolExecutor(workers) as pool:
@@ -175,13 +157,7 @@ def _sift_points(
             )
 
         matches = dict(zip(pairs, pool.map(match, pairs), strict=True))
-    positions, names, pixels = _confirm_points(cameras, features, matches, tolerance=config.CONFIRM_PIXELS)
-    colors = np.empty((len(positions), 3), np.uint8)
-    for index, name in enumerate(cameras):
-        own = names == index
-        column, row = pixels[own].astype(np.intp).T
-        colors[own] = images[name][row, column]
-    return positions, colors
+    return _confirm_points(cameras, features, matches, tolerance=config.CONFIRM_PIXELS)
 
 
 def _confirm_points(
@@ -190,11 +166,8 @@ def _confirm_points(
     matches: Mapping[Pair, Indices],
     *,
     tolerance: float,
-) -> tuple[Floats, Indices, Floats]:
-    """Points of keypoints whose matches in two other views agree.
-
-    Returns the points ``[P, 3]``, and the camera (index) and pixel ``[P, 2]`` of their keypoint.
-    """
+) -> Floats:
+    """Points ``[P, 3]`` of keypoints whose matches in two other views agree."""
     order = {name: index for index, name in enumerate(cameras)}
     records: list[Floats] = []  # camera, keypoint, other camera, depth, position, pixel in the other camera
     for (first, second), match in matches.items():
@@ -205,7 +178,7 @@ def _confirm_points(
             head[:, 1] = match[:, side]
             records.append(np.concatenate([head, depths[:, side : side + 1], points, seen], 1))
     if not records:  # poses under which no two cameras see the same
-        return np.empty((0, 3)), np.empty(0, np.intp), np.empty((0, 2))
+        return np.empty((0, 3))
     table = np.concatenate(records)
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     # Two matches of one keypoint that agree in depth are neighbours after the sort.
@@ -218,11 +191,7 @@ def _confirm_points(
             agree[rows] = (depths > 0) & (np.linalg.norm(seen - here[rows, 7:9], axis=1) < tolerance)
     one, two = one[agree], two[agree]
     _, single = np.unique(one[:, :2], axis=0, return_index=True)
-    own = one[single, 0].astype(np.intp)
-    pixels = np.empty((len(single), 2))
-    for name, index in order.items():
-        pixels[own == index] = features[name].pixels[one[single[own == index], 1].astype(np.intp)]
-    return (one[single, 4:7] + two[single, 4:7]) / 2, own, pixels
+    return (one[single, 4:7] + two[single, 4:7]) / 2
 
 
 def _sweep_bounds(
@@ -291,16 +260,14 @@ def _cells(points: Floats, cell: float) -> tuple[NDArray[np.int64], NDArray[np.i
 
 def _random_points(
     cameras: Mapping[str, Camera],
-    images: Mapping[str, NDArray[np.uint8]],
-    *,
     masks: Mapping[str, NDArray[np.bool_]],
+    *,
     distance: float,
     rng: np.random.Generator,
     config: PointsConfig,
-) -> tuple[Floats, NDArray[np.uint8]]:
-    """Random points in the cameras' views, uniform in inverse depth, with the colours of their pixels."""
+) -> Floats:
+    """Random points ``[P, 3]`` in the cameras' views, uniform in inverse depth."""
     positions: list[Floats] = []
-    colors: list[NDArray[np.uint8]] = []
     each = -(-config.RANDOM_POINTS // len(cameras))
     for name, camera in cameras.items():
         near = max(config.NEAR_SHARE * distance, camera.near)
@@ -309,7 +276,5 @@ def _random_points(
         if name in masks:
             counts = masks[name][tuple(pixels.astype(np.intp).T[::-1])]
             pixels, inverse = pixels[counts], inverse[counts]
-        column, row = pixels.astype(np.intp).T
         positions.append(back_project(camera, pixels, 1 / inverse))
-        colors.append(images[name][row, column])
-    return np.concatenate(positions), np.concatenate(colors)
+    return np.concatenate(positions)

@@ -12,11 +12,9 @@ is behind in the others. Who stands at one place throughout the take is not know
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.images import opencv, read_picture, reduced_mask
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.prepared import ROVING, PreparedCamera, PreparedCapture
-from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, resized_to
+from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, closed, resized_to
 from structgstream.data.undistortion import Undistortion
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame, RovingPicture
@@ -124,19 +122,14 @@ class WithRoving(SourceWrapper):
         seen: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in self.rig.training}
         count = min(INSTANTS, len(self.whole))
         for index in np.linspace(0, len(self.whole) - 1, count).round().astype(int).tolist():
-            for shown in _one(self.whole, index):
-                for name in seen.keys() & shown.images.keys():
-                    seen[name].append(reduced(shown.images[name]))
+            with closed(self.whole.frames(index)) as frames:
+                shown = next(frames)
+            for name in seen.keys() & shown.images.keys():
+                seen[name].append(reduced(shown.images[name]))
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
 MIN_INSTANTS = 3  # below which none is frequent
-
-
-def _one(source: FrameSource, index: int) -> Iterator[MultiViewFrame]:
-    frames: Any = source.frames(index)
-    with closing(frames):
-        yield from islice(frames, 1)
 
 
 def with_roving(source: FrameSource, whole: FrameSource, folder: Path, capture: PreparedCapture) -> FrameSource:
@@ -169,10 +162,10 @@ def frame_points(
     is added, which is too large, and harms where there are matches.
     """
     config, roving = config or PointsConfig(), roving_of(source)
-    found = initial_points(frame, source.rig, config=config, seed=seed).positions
+    found = initial_points(frame, source.rig, config=config, seed=seed)
     if roving is None or frame.index > 0:
         return found
-    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
+    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed)
     moving, hull = found[roving.moving(found, frame)], roving.hull(frame)
     lacking = len(moving) < MATCHED_SHARE * len(hull)
     _log.info("Of what moves %d points were matched; %d of its hull are added", len(moving), lacking * len(hull))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper
+from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, innermost
 from structgstream.data.timeline import Clock
 from structgstream.data.video import VideoSource
 from structgstream.data.video_index import load_av
@@ -203,6 +203,7 @@ class FileFeed:
         self._source = source
         self._packets = self._encoded()
         self._next: OpusPacket | None = None
+        self._end: float | None = None  # presentation time at which the packets that were taken end
         self._reported = False
 
     def until(self, seconds: float) -> list[OpusPacket]:
@@ -213,13 +214,13 @@ class FileFeed:
             if packet.seconds >= seconds:
                 return found
             found.append(packet)
+            self._end = packet.seconds + PACKET_SECONDS
         self._next = None
-        if not self._reported and (not found or found[-1].seconds + 2 * PACKET_SECONDS < seconds):
+        if not self._reported and (self._end is None or self._end + PACKET_SECONDS < seconds):
             self._reported = True
-            end = found[-1].seconds + PACKET_SECONDS if found else None
             log.warning(
-                "The sound of %s ends %s; what follows is silent",
-                self._source.name, "before these frames" if end is None else f"at {end:.1f} s, before the pictures",
+                "The sound of %s ends %s; what follows is silent", self._source.name,
+                "before these frames" if self._end is None else f"at {self._end:.1f} s, before the pictures",
             )  # fmt: skip
         return found
 
@@ -303,9 +304,8 @@ def start_seconds(source: FrameSource) -> float:
 
 def camera_videos(source: FrameSource) -> dict[str, Path]:
     """The videos of a capture's cameras, by name; nothing for pictures."""
-    while isinstance(source, SourceWrapper):
-        source = source.source
-    return {name: track.path for name, track in source.tracks.items()} if isinstance(source, VideoSource) else {}
+    inner = innermost(source)
+    return {name: track.path for name, track in inner.tracks.items()} if isinstance(inner, VideoSource) else {}
 
 
 class SoundDecoder:
@@ -370,10 +370,10 @@ def read_audio(path: Path, *, rate: int = SAMPLE_RATE) -> NDArray[np.float32] | 
                     start_seconds = 0.0 if frame.time is None else float(frame.time)
                 parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(frame)]
             parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(None)]
-        except av.error.FFmpegError as error:
+        except (av.error.FFmpegError, ValueError) as error:  # The latter where channels or rate change.
             raise CaptureError(
-                f"The sound of {path} cannot be decoded ({error.strerror}); copy the file again, or synchronise by "
-                "another method."
+                f"The sound of {path} cannot be decoded ({getattr(error, 'strerror', error)}); copy the file "
+                "again, or synchronise by another method."
             ) from None
     if not parts or start_seconds is None:
         return None

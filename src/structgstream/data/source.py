@@ -11,7 +11,7 @@ more, is read from the source again, which has those that a resumed run needs.
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence, Sized
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Generic, Protocol, TypeGuard, TypeVar, runtime_checkable
@@ -83,6 +83,16 @@ def is_recording(source: FrameStream) -> TypeGuard[FrameSource]:
 def frame_count(source: FrameStream) -> int | None:
     """Number of frames; None if it is unknown before the end."""
     return len(source) if is_recording(source) else None
+
+
+@contextmanager
+def closed(frames: Iterator[MultiViewFrame]) -> Iterator[Iterator[MultiViewFrame]]:
+    """``frames``, which may hold a thread or a decoder, closed at the end."""
+    try:
+        yield frames
+    finally:
+        if hasattr(frames, "close"):  # An iterator need not be a generator.
+            frames.close()  # type: ignore[attr-defined]
 
 
 Source = TypeVar("Source", bound=FrameStream)
@@ -393,7 +403,8 @@ class SharedFrames:
         with self._changed:
             frames, self._frames, self._ended = self._frames, None, True
         if frames is not None:
-            _close(frames)
+            with closed(frames):
+                pass
 
     def _read(self) -> None:
         """Reads a frame without the lock, so that others may take cached ones."""
@@ -418,11 +429,8 @@ class SharedFrames:
 
     def _again(self, index: int) -> MultiViewFrame | None:
         """A frame of before."""
-        frames = self._source.frames(index)
-        try:
+        with closed(self._source.frames(index)) as frames:
             return next(frames, None)
-        finally:
-            _close(frames)
 
     def _retain(self) -> None:
         firsts = dict.fromkeys(first for first, _ in self._needs)
@@ -453,8 +461,3 @@ class _RecordingReader(_Reader):
 
     def __len__(self) -> int:
         return len(self.source)  # type: ignore[arg-type]
-
-
-def _close(frames: Iterator[MultiViewFrame]) -> None:
-    with suppress(AttributeError):  # An iterator need not be a generator.
-        frames.close()  # type: ignore[attr-defined]

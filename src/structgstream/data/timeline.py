@@ -182,6 +182,7 @@ def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -
     """The last slot that half of the cameras, and two training cameras, reach."""
     ends = sorted((own[-1] for own in slots.values()), reverse=True)
     trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
+    trained = trained or ends  # a rig without training cameras is refused where it is made
     return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
 

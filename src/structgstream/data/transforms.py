@@ -152,7 +152,8 @@ def open_transforms(path: Path) -> FrameSource:
     if files[0].name == WHOLE and any(shot.time is None for shot in shots):
         return open_posed(path, read(files), fps=stated_fps(files[0]))
     cameras = _by_pose(shots, files[0])
-    pictures = {name: _instants(own) for name, own in cameras.items()}
+    zero = min([0.0, *(shot.time for shot in shots if shot.time is not None)])
+    pictures = {name: _instants(own, zero) for name, own in cameras.items()}
     poses = {name: own[0].camera for name, own in cameras.items()}
     held_out = [name for name, own in cameras.items() if own[0].held_out]
     calibration = Calibration(files[0], tuple(poses.values()), held_out=held_out)
@@ -184,10 +185,12 @@ def _part(file: Path, part: str) -> str:
     return file.parent.name if part == "parent" else file.stem
 
 
-def _instants(shots: Sequence[Shot]) -> dict[str, Path]:
-    """The pictures of a camera by time, or by the part of their names that differs."""
-    if all(shot.time is not None for shot in shots):
-        return {f"{shot.time:.6f}": shot.file for shot in shots}
+def _instants(shots: Sequence[Shot], zero: float) -> dict[str, Path]:
+    """The pictures of a camera by time from ``zero`` on, since names have no sign, or by the part of their names that
+    differs."""
+    times = [shot.time for shot in shots if shot.time is not None]
+    if len(times) == len(shots):
+        return {f"{time - zero:.6f}": shot.file for time, shot in zip(times, shots, strict=True)}
     if len(shots) == 1:
         return {"0": shots[0].file}
     part = "stem" if len({shot.file.stem for shot in shots}) == len(shots) else "parent"

@@ -4,7 +4,8 @@
 Note [Damaged videos]
 ~~~~~~~~~~~~~~~~~~~~~
 A frame counts as decodable if all frames from the key frame before it on are. So what is lost does not depend on where
-reading starts, and a resumed stream sees what the first run saw. After damage, reading continues at the next key frame.
+reading starts, and a resumed stream sees what the first run saw. After damage, reading continues at the next key frame
+that decodes alone.
 
 Note [High dynamic range]
 ~~~~~~~~~~~~~~~~~~~~~~~~~
@@ -133,9 +134,10 @@ def synchronised(
     Args:
         tracks: camera name to its video.
         where: the capture, for messages and for its name.
-        fps: frames a second; measured from the time stamps when None.
-        clocks: camera name to its clock; None if time stamps are of one clock, are taken at the rate ``fps`` if that
-            is given, and no camera has two frames for one instant.
+        fps: frames a second of the instants; measured from the time stamps when None. Without clocks it is only
+            compared with those, since instants at a rounded rate would miss frames.
+        clocks: camera name to its clock; None if time stamps are of one clock, and no camera has two frames for one
+            instant.
 
     Raises:
         CalibrationError: a video's size is not the size that its camera's intrinsics are for.
@@ -157,7 +159,8 @@ def synchronised(
             f"{where} states {fps:g} frames a second, the time stamps of its videos say {measured:g}; "
             "correct the number."
         )
-    rate = fps or measured or 30.0  # one frame per camera: any rate is right
+    # Of one frame per camera any rate is right.
+    rate = fps if fps and clocks is not None else measured or fps or 30.0
     positions = {name: times[name] * rate for name in rig}
     origin = origin_of(list(positions.values()))
     placed = {name: place(own - origin) for name, own in positions.items()}
@@ -249,7 +252,7 @@ def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Gen
     """The frames at the time stamps ``wanted``, without those that are lost (Note [Damaged videos])."""
     if not wanted:
         return
-    at, begin, seeks = 0, _key_before(track, wanted[0]), True
+    at, begin, restarted = 0, _key_before(track, wanted[0]), False
     while at < len(wanted):
         run = _Run(track, begin)
         with closing(run.frames()) as frames:
@@ -259,16 +262,17 @@ def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Gen
                     yield frame
                     if at == len(wanted):
                         return
-        if run.landed_late:  # Such a file is read from its beginning, and given up at its first damage.
-            begin, seeks = None, False
+        if begin is not None and not run.met and not restarted:
+            # Without an index the seek may miss the key frame (MPEG), which may also not decode alone (intra refresh).
+            begin, restarted = None, True
             continue
         following = bisect_right(track.keyframes, run.lost if begin is None else max(run.lost, begin))
-        begin = track.keyframes[following] if seeks and following < len(track.keyframes) else None
+        begin = track.keyframes[following] if following < len(track.keyframes) else None
         on_damage(run.lost, begin, run.reason)
         if begin is None:
             return
         at = max(at, bisect_left(wanted, begin))
-        if at < len(wanted):
+        if at < len(wanted) and not restarted:  # Else every key frame is tried in its order, wherever reading starts.
             begin = max(begin, _key_before(track, wanted[at]) or begin)
 
 
@@ -279,8 +283,7 @@ class _Run:
     track: VideoTrack  # the video
     begin: int | None  # time stamp of a key frame; None for the beginning
     expected: int = 0  # number of the next frame in the video's order
-    met: bool = False  # whether the first frame came
-    landed_late: bool = False  # whether the seek landed after the key frame, as it may without an index (MPEG-TS)
+    met: bool = False  # whether the frame at ``begin`` came
     reason: str = "a frame is missing or broken"  # why it ended
 
     @property
@@ -305,7 +308,6 @@ class _Run:
                     if frame.pts is None or frame.pts < (stamps[0] if begin is None else begin):
                         continue  # cut by the container's edit list, or before the key frame
                     if not self.met and begin is not None and frame.pts > begin:
-                        self.landed_late = container.format.name == "mpegts"
                         return
                     if not self.met:
                         self.expected, self.met = 0 if begin is None else bisect_left(stamps, begin), True

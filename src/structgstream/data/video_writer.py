@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.atomic_files import give_name, partial_path
+from structgstream.data.video import ACCURATE_ROUNDING, BICUBIC, BT709, FULL_RANGE, LIMITED_RANGE
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
 from structgstream.opus import SAMPLE_RATE
 
-BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
 SOUND_BITS_PER_SECOND = 128_000
 TICKS = 90_000  # a second, of pictures with times
-BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
 
 
 class VideoWriter(AbstractContextManager["VideoWriter"]):

@@ -262,9 +262,7 @@ class PoseCheck:
 
     matches: int  # number of good matches
     share_violating: float  # share of these that violate the poses; nan without matches
-    off: tuple[str, ...] = ()  # cameras that are off; empty where all is right
-    unmatched: tuple[str, ...] = ()  # cameras without a match to any other that was tried
-    findings: tuple[Finding, ...] = ()  # what is off, in sentences
+    unmatched: tuple[str, ...]  # cameras without a match to any other that was tried
 
     @property
     def conclusive(self) -> bool:
@@ -316,8 +314,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
             "at structgstream prepare --check.",
             listed(check.unmatched, limit=12), len(cameras),
         )  # fmt: skip
-    off = tuple(cameras) if verdict.suspects.everything else verdict.suspects.off
-    return PoseCheck(check.matches, check.share_violating, off, check.unmatched, tuple(findings))
+    return check
 
 
 def _contradicted(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
@@ -332,4 +329,4 @@ def _summed(errors: Mapping[tuple[str, str], PairError], cameras: Mapping[str, C
     violating = sum(error.matches * error.share for error in errors.values())
     matched = {name for pair in errors for name in pair}
     unmatched = tuple(name for name in cameras if name not in matched)
-    return PoseCheck(total, violating / total if total else float("nan"), unmatched=unmatched)
+    return PoseCheck(total, violating / total if total else float("nan"), unmatched)
