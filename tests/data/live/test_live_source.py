@@ -406,14 +406,24 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
     assert source.faults.counts["b"] == {"garbage": 1}
 
 
-def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
-    path, folder = files(tmp_path), tmp_path / "take"
-    options = LiveOptions(record=folder, frames=6)
-    list(LiveSource(path, tmp_path / "x.sgs", options).frames())
-    before = (folder / "a.ts").read_bytes()
-    list(LiveSource(path, tmp_path / "y.sgs", options).frames())
-    assert (folder / "a.ts").read_bytes() == before
-    assert len(open_capture(folder / "part-001")) >= 5
+@pytest.mark.parametrize(
+    ("existing", "parts"), [("take/a.ts", ["part-001", "part-002"]), ("take/part-003/a.ts", ["part-004"])]
+)
+def test_a_recording_replaces_nothing(
+    tmp_path: Path, existing: str, parts: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not even the film of its own cameras, or an earlier recording."""
+    path, folder, film = files(tmp_path), tmp_path / "take", tmp_path / existing
+    film.parent.mkdir(parents=True)
+    (tmp_path / "a.ts").rename(film)
+    path.write_text(path.read_text().replace('"a.ts"', f'"{existing}"'))
+    before = film.read_bytes()
+    for part in parts:
+        options = LiveOptions(record=folder, frames=6)
+        list(LiveSource(path, tmp_path / f"{part}.sgs", options).frames())
+        assert len(open_capture(folder / part)) >= 5
+        assert f"{folder} is not empty; the recording goes to {folder / part}" in caplog.text
+    assert film.read_bytes() == before
 
 
 def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ returns with another codec, size or parameters, every camera continues, at its n
 
 import json
 import logging
+import re
 import threading
 from bisect import bisect_right
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from structgstream.data.live.status import FaultLog
-from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
+from structgstream.data.prepared import PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
@@ -43,7 +44,7 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
 
 class Recording:
-    """The folder of a recording, which is made; a recording in it is continued in its next part.
+    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part.
 
     Raises:
         StorageError: it cannot be written, here or later.
@@ -53,13 +54,13 @@ class Recording:
         self._folder, self._calibration, self._fps = folder, calibration, fps
         self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.RLock()
-        self._first = 0
-        while (_part(folder, self._first) / FILE).exists():
-            self._first += 1
+        self._first = _first_part(folder)
         self._files: dict[int, dict[str, str]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
-        self.folder(0, {})
+        made = self.folder(0, {})
+        if self._first:
+            log.warning("%s is not empty; the recording goes to %s", folder, made)
 
     def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
         """The recorder of a camera."""
@@ -236,3 +237,13 @@ def _codec(stream: Any) -> tuple[object, ...]:
 
 def _part(folder: Path, number: int) -> Path:
     return folder if number == 0 else folder / f"part-{number:03d}"
+
+
+def _first_part(folder: Path) -> int:
+    """The number of the first part of another recording in a folder: nothing is in it, nor in those that follow."""
+    try:
+        entries = [entry.name for entry in folder.iterdir()] if folder.exists() else []
+    except OSError as error:
+        raise StorageError(f"The folder {folder} cannot be read ({error.strerror}).") from None
+    parts = (re.fullmatch(r"part-(\d{3,})", name) for name in entries)
+    return 1 + max((int(part[1]) for part in parts if part), default=0) if entries else 0
