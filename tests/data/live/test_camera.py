@@ -155,6 +155,68 @@ def test_lost_datagrams_are_a_damage() -> None:
     assert 40 <= len(received.pictures) < 60
 
 
+class Packets:
+    """Notes what is to be recorded of a camera."""
+
+    def __init__(self) -> None:
+        self.found: list[tuple[Any, float]] = []
+
+    def record(self, packet: Any, *, shift_seconds: float) -> None:
+        self.found.append((packet, shift_seconds))
+
+    def shown(self) -> Received:
+        """Its pictures, decoded again, at the times of their packets."""
+        received, decoder = Received(), av.CodecContext.create("h264", "r")
+        seconds = {packet.pts: float(packet.pts * packet.time_base) + shift for packet, shift in self.found}
+        for packet in (*(packet for packet, _ in self.found), None):
+            for frame in decoder.decode(packet):  # type: ignore[attr-defined]
+                received.deliver("a", LivePicture(seconds[frame.pts], 0.0, frame))
+        return received
+
+
+def with_b_frames(x264: str, first: int = 0) -> bytes:
+    """Five groups of 12 pictures of the film from number ``first`` on."""
+    written = io.BytesIO()
+    with av.open(written, "w", format="mpegts") as output:
+        options = {"x264-params": f"keyint=12:min-keyint=12:scenecut=0:b-adapt=0:{x264}"}
+        stream = output.add_stream("libx264", rate=30, options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        for number in range(first, first + 60):
+            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return written.getvalue()
+
+
+@pytest.mark.parametrize("base", [TimeBase.STREAM, TimeBase.ARRIVAL])
+@pytest.mark.parametrize("x264", ["bframes=0", "bframes=3", "bframes=3:open-gop=1"])
+def test_what_is_recorded_after_a_loss_begins_with_a_key_frame(x264: str, base: TimeBase) -> None:
+    """Decoders give pictures back some packets later, where B-frames refer to pictures after them."""
+    stream, packets, received = with_b_frames(x264), Packets(), Received()
+    middle = len(stream) // 3 // 188 * 188
+    waiting = [stream[:middle] + stream[middle + 188 * 3 :], with_b_frames(x264, first=240)]
+    feed, _ = camera_feed(
+        received,
+        base=base,
+        open_camera=lambda camera, timeout: closing(av.open(io.BytesIO(waiting.pop(0)))),
+        wait=lambda seconds: None if waiting else feed.stop(),
+        recorder=packets,
+    )
+    feed.start()
+    feed.join(WAIT)
+    recorded = packets.shown()
+    assert 90 < len(recorded.pictures) <= len(received.pictures) < 120
+    if base is TimeBase.STREAM:
+        first = recorded.pictures[0].seconds
+        assert recorded.numbers == [round((one.seconds - first) / PERIOD) % 12 for one in recorded.pictures]
+        assert {one.seconds for one in recorded.pictures} <= {one.seconds for one in received.pictures}
+    else:
+        assert len(recorded.numbers) == len(recorded.pictures)
+        assert all(np.isfinite(shift) for _, shift in packets.found)
+
+
 def test_a_picture_of_other_proportions_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         received, faults = read(sent_stream("shape:0.8:0.4"))

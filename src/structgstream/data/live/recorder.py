@@ -4,8 +4,8 @@
 Each camera has a file: MPEG-TS for codecs that it supports, Matroska for others; both can be read up to where a crash
 truncated them. Time stamps are those of the common clock, less its value at the start, so that a camera that
 reconnected or whose clock was reset stays synchronised; pictures are not encoded again. ``capture.json`` makes the
-folder a prepared capture of the cameras that sent something. Damaged packets, and pictures of another size, are not
-recorded.
+folder a prepared capture of the cameras that sent something. Damaged packets, those after them up to the next key
+packet, and pictures of other proportions are not recorded.
 
 A file has one codec, and time stamps of MPEG-TS wrap after 26 hours. After :data:`PART_SECONDS`, and when a camera
 returns with another codec, size or parameters, every camera continues, at its next key frame, in the folder
