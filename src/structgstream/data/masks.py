@@ -7,12 +7,13 @@
     masks/CAMERA/FRAME.png    for one; FRAME is the name of the frame's pictures, of videos its number from 0
 
 They have the size of the pictures or videos as stored (before undistortion). Where a camera has both, both hold. One
-that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
+that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``. Live cameras have no
+numbered frames, so only masks for all frames count.
 """
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -104,13 +105,20 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     return picture.any(axis=2)
 
 
-def with_masks(source: FrameSource, folder: Path) -> FrameSource:
-    """The whole capture ``source``, as its layout is read, with the masks of ``folder``; itself when there are none."""
+def with_masks(source: FrameSource, folder: Path, *, without: Collection[str] = ()) -> FrameSource:
+    """The whole capture ``source``, as its layout is read, with the masks of ``folder``; itself when there are none.
+
+    ``without`` are names of cameras that the source leaves out, whose masks are not used.
+    """
     found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
     entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
-    if not entries:
+    named = {entry.name if entry.is_dir() else entry.stem: entry for entry in entries}
+    names = {name: entry for name, entry in named.items() if name not in without}
+    if not len(source) and (single := [entry.name for entry in entries if entry.is_dir()]):
+        log.warning("%s: the masks of single frames of %s are not used: it is live", source.name, listed(single))
+        names = {name: entry for name, entry in names.items() if not entry.is_dir()}
+    if not names:
         return source
-    names = {entry.name if entry.is_dir() else entry.stem: entry for entry in entries}
     for name, entry in names.items():
         if name not in source.rig.cameras:
             raise CaptureError(
@@ -145,10 +153,15 @@ def _is_mask(file: Path) -> bool:
     return suffix == ".png"
 
 
+def lasting_mask(folder: Path, name: str) -> Path | None:
+    """The mask of a camera in ``folder`` for all frames; None if it has none."""
+    return by_stem(_masks(folder)).get(name) if folder.is_dir() else None
+
+
 def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
     """The mask files of a camera, the first of which is checked."""
-    always, own = by_stem(_masks(folder)).get(name), folder / name
-    files = by_stem(_masks(own)) if own.is_dir() else {}
+    always, own = lasting_mask(folder, name), folder / name
+    files = by_stem(_masks(own)) if own.is_dir() and len(source) else {}
     inner, instants = innermost(source), ()
     if isinstance(inner, ImageSource):  # frames of videos have no names
         instants = inner.instants or tuple("" if file is None else file.stem for file in inner.files[name])

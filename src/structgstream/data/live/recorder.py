@@ -24,7 +24,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from structgstream.atomic_files import atomic_write
 from structgstream.data.live.status import FaultLog
+from structgstream.data.masks import FOLDER, lasting_mask
 from structgstream.data.prepared import PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
 from structgstream.data.video_index import load_av
@@ -46,12 +48,15 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 class Recording:
     """The folder of a recording, which is made; if it is not empty, the recording goes to its next part.
 
+    Args:
+        masks: folder of masks of the calibration; those for all frames are copied.
+
     Raises:
         StorageError: it cannot be written, here or later.
     """
 
-    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float) -> None:
-        self._folder, self._calibration, self._fps = folder, calibration, fps
+    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, masks: Path) -> None:
+        self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
         self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.RLock()
         self._first = _first_part(folder)
@@ -108,6 +113,9 @@ class Recording:
             }
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
             write_prepared(folder, capture.only(known) if known else capture)
+            for name in files:
+                if (mask := lasting_mask(self._masks, name)) is not None:
+                    atomic_write(folder / FOLDER / f"{name}.png", mask.read_bytes(), called="The mask", new_folder=True)
             return folder
 
     def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
