@@ -67,7 +67,7 @@ class SceneCodec:
 
     def key_interval(self, fps: float) -> int:
         """Frames from one key packet to the next."""
-        return max(1, round(fps * self.config.key_interval_seconds))
+        return self.config.key_interval(fps)
 
     def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[FileSink, StreamReader | None]:
         """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
