@@ -281,7 +281,6 @@ def stream_pipeline(
         SceneCodec(config),
         config=to_json(config),
         seed=config.seed,
-        normalised_radius=config.NORMALISED_RADIUS,
         points=config.points,
         rate=config.rate,
         period=config.period,

@@ -73,6 +73,11 @@ class Received:
         return [round((b - a) / PERIOD) for a, b in itertools.pairwise(times)]
 
 
+def clock(base: TimeBase, *, offset_seconds: float = 0.0) -> ClockMapper:
+    """The clock of a camera alone."""
+    return ClockMapper(base, resets=ClockResets(), offset_seconds=offset_seconds)
+
+
 def camera_feed(
     received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, **opening: Any
 ) -> tuple[CameraFeed, FaultLog]:
@@ -83,7 +88,7 @@ def camera_feed(
         camera,
         size=(128, 96),
         receiver=received,
-        clock=ClockMapper(base),
+        clock=clock(base),
         faults=faults,
         base=base,
         now=lambda: next(ticks) * PERIOD / 2,
@@ -436,9 +441,9 @@ def test_arrival_keeps_the_spacing_of_the_stamps_in_spite_of_jitter() -> None:
     """The least delay wins: after the first pictures, times lie where the quickest network would have put them."""
     stamps = np.arange(300) * PERIOD
     jitter = np.random.default_rng(0).uniform(0, 0.05, 300)
-    times = placed(ClockMapper(TimeBase.ARRIVAL), stamps, UNIX + stamps + 0.02 + np.maximum.accumulate(jitter * 0))
+    times = placed(clock(TimeBase.ARRIVAL), stamps, UNIX + stamps + 0.02 + np.maximum.accumulate(jitter * 0))
     assert times == pytest.approx(list(UNIX + stamps + 0.02), abs=1e-6)
-    late = placed(ClockMapper(TimeBase.ARRIVAL), stamps, np.maximum.accumulate(UNIX + stamps + 0.02 + jitter))
+    late = placed(clock(TimeBase.ARRIVAL), stamps, np.maximum.accumulate(UNIX + stamps + 0.02 + jitter))
     errors = np.array(late[60:]) - (UNIX + stamps + 0.02)[60:]
     assert errors.min() > -1e-6
     assert errors.max() < 0.005  # the least of 60 uniform values of 50 ms
@@ -450,7 +455,7 @@ def test_pictures_that_were_held_back_are_no_jump() -> None:
     arrivals = np.maximum(UNIX + stamps, UNIX + np.where((stamps > 3) & (stamps < 7), 7, 0))
     arrivals = np.maximum.accumulate(arrivals + 1e-4 * np.arange(300))
     for base in (TimeBase.ARRIVAL, TimeBase.STREAM):
-        mapper = ClockMapper(base)
+        mapper = clock(base)
         found = [mapper.map(stamp, arrived=at) for stamp, at in zip(stamps, arrivals, strict=True)]
         assert [item.fault for item in found] == [None] * 300
         assert np.allclose(np.diff(seconds_of(found)), PERIOD, atol=2e-4)
@@ -459,18 +464,18 @@ def test_pictures_that_were_held_back_are_no_jump() -> None:
 def test_a_clock_that_runs_fast_is_followed_by_arrival() -> None:
     stamps = np.arange(0, 3600, 0.5)
     arrivals = UNIX + stamps / 1.0002  # 0.7 s an hour
-    times = placed(ClockMapper(TimeBase.ARRIVAL), stamps, arrivals)
+    times = placed(clock(TimeBase.ARRIVAL), stamps, arrivals)
     assert np.abs(np.array(times) - arrivals).max() < 0.008
 
 
 def test_stream_takes_stamps_and_offsets() -> None:
-    assert placed(ClockMapper(TimeBase.STREAM, offset_seconds=-0.25), [5.0, 5.5], [UNIX, UNIX + 0.5]) == [4.75, 5.25]
+    assert placed(clock(TimeBase.STREAM, offset_seconds=-0.25), [5.0, 5.5], [UNIX, UNIX + 0.5]) == [4.75, 5.25]
 
 
 @pytest.mark.parametrize("jump", [100.0, -100.0, 1e6, -1.5])
 @pytest.mark.parametrize("base", TimeBase)
 def test_after_a_jump_pictures_go_on_as_late_as_before(base: TimeBase, jump: float) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     before, after = np.arange(90) * PERIOD, np.arange(90, 180) * PERIOD
     start = placed(mapper, before, UNIX + before + 0.03)
     found = mapper.map(after[0] + jump, arrived=UNIX + after[0] + 0.034)
@@ -499,7 +504,7 @@ def test_cameras_whose_common_clock_is_set_stay_in_step_exactly() -> None:
 @pytest.mark.parametrize("base", TimeBase)
 @pytest.mark.parametrize("stamp", [0.0, 3.0, 5000.0])
 def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     placed(mapper, np.arange(91) * PERIOD, UNIX + np.arange(91) * PERIOD)
     mapper.reconnect()
     found = [mapper.map(stamp + t, arrived=UNIX + 10 + t) for t in np.arange(30) * PERIOD]
@@ -511,7 +516,7 @@ def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float)
 
 
 def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
-    mapper = ClockMapper(TimeBase.STREAM)
+    mapper = clock(TimeBase.STREAM)
     stamps = [0.0, 0.1, 0.1, 0.3, 0.2, 0.4]
     found = [mapper.map(stamp, arrived=UNIX + 0.1 * n) for n, stamp in enumerate(stamps)]
     assert [item.fault for item in found] == [None, None, Fault.DUPLICATE, None, Fault.REORDERED, None]
@@ -520,7 +525,7 @@ def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
 
 @pytest.mark.parametrize("base", TimeBase)
 def test_stamps_of_33_bits_wrap(base: TimeBase) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     true = WRAP - 1 + np.arange(60) * PERIOD
     found = [mapper.map(t % WRAP, arrived=UNIX + t, wrap_seconds=WRAP) for t in true]
     assert {item.fault for item in found} == {None}
@@ -528,7 +533,7 @@ def test_stamps_of_33_bits_wrap(base: TimeBase) -> None:
 
 
 def test_unix_stamps_are_found_again_from_33_bits() -> None:
-    mapper = ClockMapper(TimeBase.UNIX)
+    mapper = clock(TimeBase.UNIX)
     true = UNIX + np.arange(10) * PERIOD
     times = placed(mapper, true % WRAP, true + 0.2, wrap_seconds=WRAP)
     assert times == pytest.approx(list(true), abs=1e-5)
@@ -541,7 +546,7 @@ def test_unix_stamps_are_found_again_from_33_bits() -> None:
 )
 @examples(150)
 def test_times_rise_whatever_comes(base: TimeBase, steps: list[tuple[float, float]]) -> None:
-    mapper, stamp, arrived, last = ClockMapper(base), 0.0, UNIX, -np.inf
+    mapper, stamp, arrived, last = clock(base), 0.0, UNIX, -np.inf
     for by, wait in steps:
         stamp, arrived = stamp + by, arrived + wait
         seconds = mapper.map(stamp, arrived=arrived, wrap_seconds=WRAP).seconds

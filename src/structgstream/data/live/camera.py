@@ -103,9 +103,8 @@ class ClockMapper:
     ``offset_seconds`` is added to every time.
     """
 
-    def __init__(self, base: TimeBase, *, offset_seconds: float = 0.0, resets: ClockResets | None = None) -> None:
-        self._base, self._offset = base, offset_seconds
-        self._resets = ClockResets() if resets is None else resets
+    def __init__(self, base: TimeBase, *, resets: ClockResets, offset_seconds: float = 0.0) -> None:
+        self._base, self._resets, self._offset = base, resets, offset_seconds
         self._delay = MinimumDelayFilter()
         self._stamp: float | None = None
         self._seconds = -float("inf")
