@@ -4,6 +4,7 @@
 import json
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
@@ -12,7 +13,9 @@ import pytest
 from structgstream.cli.app import INTERRUPTED, PROBLEM, USAGE, main
 from structgstream.cli.live_run import stop_on_interrupt
 from structgstream.codec.reader import open_stream
+from structgstream.data.live.source import LiveSource
 from structgstream.data.open import open_capture
+from structgstream.frames import MultiViewFrame
 from tests.data.live.test_live_source import files
 from tests.support.small_presets import few_points
 
@@ -73,3 +76,18 @@ def test_ctrl_c_ends_after_the_frame_and_twice_at_once(capsys) -> None:
     assert signal.getsignal(signal.SIGINT) is before
     assert "Ends after this frame" in capsys.readouterr().err
     assert INTERRUPTED == 130
+
+
+def test_ctrl_c_before_the_first_frame_leaves_no_stream(tmp_path: Path, capsys, monkeypatch) -> None:
+    def pressed(source: LiveSource, start: int = 0) -> Iterator[MultiViewFrame]:
+        os.kill(os.getpid(), signal.SIGINT)
+        yield from whole(source, start)
+
+    whole = LiveSource.frames
+    monkeypatch.setattr(LiveSource, "frames", pressed)
+    assert live(tmp_path) == INTERRUPTED
+    said = capsys.readouterr()
+    assert "No frame was done, so no stream was written" in said.err
+    assert "Wrote" not in said.out
+    assert not (tmp_path / "x.sgs").exists()
+    assert json.loads((tmp_path / "x.metrics.json").read_text())["state"] == "finished"

@@ -42,7 +42,10 @@ def test_the_names_of_a_server() -> None:
     assert accepted_hosts("127.0.0.1", ()) == LOOPBACK_NAMES
     assert accepted_hosts("127.0.0.1", ("live.example.org",)) == (*LOOPBACK_NAMES, "live.example.org")
     assert accepted_hosts("192.0.2.1", ()) == ("*",)
-    assert accepted_hosts("192.0.2.1", ("live.example.org",)) == (*LOOPBACK_NAMES, "live.example.org")
+    assert accepted_hosts("127.0.0.2", ()) == (*LOOPBACK_NAMES, "127.0.0.2")
+    assert accepted_hosts("::1", ()) == LOOPBACK_NAMES
+    assert accepted_hosts("192.0.2.1", ("Live.example.org",)) == (*LOOPBACK_NAMES, "192.0.2.1", "live.example.org")
+    assert accepted_hosts("2001:db8::1", ("a",)) == (*LOOPBACK_NAMES, "[2001:db8::1]", "a")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from structgstream.errors import PlayerError
 from structgstream.serve.streams import REFRESH_SECONDS, Catalog, StreamKind
 
 
-def test_what_is_a_stream(tmp_path: Path) -> None:
+def test_what_is_a_stream(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("b.sgs", "a.SGS", "c.sgs.partial", ".hidden.sgs", "a b.sgs", "ä.sgs"):
         (tmp_path / name).touch()
     for name in ("studio", "empty", ".dot", "z.sgs"):
@@ -22,6 +22,9 @@ def test_what_is_a_stream(tmp_path: Path) -> None:
         ("b.sgs", StreamKind.FILE),
         ("studio", StreamKind.SEGMENTS),
     ]
+    catalog._list()
+    for name in ("a b.sgs", "ä.sgs"):
+        assert caplog.text.count(f"The stream {name!r} is not served, because names of streams are") == 1
 
 
 def test_it_looks_again_after_a_second(tmp_path: Path) -> None:
@@ -39,6 +42,10 @@ def test_what_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file.sgs").touch()
     with pytest.raises(PlayerError, match=rf"is a file; serve takes a folder of streams: {tmp_path}"):
         Catalog(tmp_path / "file.sgs")
+    (tmp_path / "Studio 1").mkdir()
+    (tmp_path / "Studio 1" / "manifest.json").touch()
+    with pytest.raises(PlayerError, match=r"Studio 1 cannot be served, because names of streams are .*; rename it\."):
+        Catalog(tmp_path / "Studio 1")
 
 
 def test_the_folder_itself_may_be_a_link(tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 import logging
 import random
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
 from structgstream.session.periods import MIN_FRAMES, KeyFrames
+from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
 from structgstream.training.online.config import OnlineConfig
 
@@ -76,6 +78,22 @@ def test_every_window_keeps_to_the_target(target_mbits: float, exponent: float, 
     later = windows[KEY_EVERY:]
     assert 0.9 < min(later) <= max(later) < 1.08
     assert sum(later) / len(later) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("fps", [0.5, 1.0, 1.4, 2.0])
+def test_the_rate_is_met_at_few_frames_a_second(fps: float) -> None:
+    """With a target there are delta packets, which alone can be pressed; without one all packets are key packets."""
+    config = StreamConfig(rate=RateConfig(1.0))
+    assert replace(config, rate=RateConfig()).key_interval(fps) == max(1, round(fps))
+    keys = KeyFrames(config.key_interval(fps), fps)
+    controller = RateController(config.rate, fps, keys=keys)
+    for index in range(60):
+        kind = keys.kind(index, index / fps)
+        if kind is PacketKind.KEY:
+            keys.begin(index, index / fps)
+        size = 200e3 / fps * (0.2 if kind is PacketKind.KEY else controller.pressure ** (-1 / 3))
+        controller.add(int(size), kind, index=index, pts_seconds=index / fps)
+    assert controller.rate_mbits == pytest.approx(1.0, rel=0.02)
 
 
 def test_a_key_packet_is_saved_for_before_it_comes() -> None:

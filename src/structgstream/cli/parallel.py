@@ -361,7 +361,7 @@ def plan(arguments: list[str]) -> None:
     from structgstream.parallel.cost import Work, measured_in
 
     source = open_selected_capture(options.scene, options.capture)
-    interval = max(1, round(config.key_interval_seconds * source.fps))
+    interval = config.key_interval(source.fps)
     with usage_errors():
         work = Work(options.length or len(source), options.groups or interval, interval)
         if options.workers < 1 or min(options.machines, default=0) < 1:

@@ -293,6 +293,8 @@ def _follow(
                 if pressed.is_set() and done != total:
                     raise KeyboardInterrupt
         ending.end(whole=done == total)  # Live cameras had nothing to give any more.
+        if not done:
+            raise KeyboardInterrupt  # They were stopped before frame 0.
     return peaks
 
 

@@ -57,7 +57,7 @@ class Serve:
     proxy: Words = ()
     """Addresses or networks of reverse proxies, whose X-Forwarded-For and X-Forwarded-Proto are trusted."""
     connections: int = 1000
-    """Connections from which on requests are answered with 503."""
+    """Largest number of connections; while there are more, requests are answered with 503."""
 
 
 def main(arguments: list[str]) -> None:

@@ -9,11 +9,12 @@
 
 They are of the pictures or videos as they are shown, turned where those are, before undistortion. Where a camera has
 both, both hold. One that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
+Live cameras have no numbered frames, so only masks for all frames count.
 """
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -106,10 +107,17 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     return picture.any(axis=2)
 
 
-def with_masks(source: FrameSource, folder: Path) -> FrameSource:
-    """The whole capture ``source``, as its layout is read, with the masks of ``folder``; itself when there are none."""
+def with_masks(source: FrameSource, folder: Path, *, without: Collection[str] = ()) -> FrameSource:
+    """The whole capture ``source``, as its layout is read, with the masks of ``folder``; itself when there are none.
+
+    ``without`` are names of cameras that the source leaves out, whose masks are not used.
+    """
     found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
     entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
+    entries = [entry for entry in entries if name_of(entry) not in without]
+    if not len(source) and (single := [entry.name for entry in entries if entry.is_dir()]):
+        log.warning("%s: the masks of single frames of %s are not used: it is live", source.name, listed(single))
+        entries = [entry for entry in entries if not entry.is_dir()]
     if not entries:
         return source
     names = {name_of(entry): entry for entry in entries}
@@ -149,16 +157,25 @@ def _is_mask(file: Path) -> bool:
     return suffix == ".png"
 
 
+def lasting_mask(folder: Path, name: str) -> Path | None:
+    """The mask of a camera in ``folder`` for all frames; None if it has none."""
+    return by_stem(_masks(folder)).get(name) if folder.is_dir() else None
+
+
 def _files(folder: Path, name: str, source: FrameSource, own: Path | None) -> CameraMasks:
     """The mask files of a camera, the first of which is checked; those of single frames lie in ``own``."""
-    always, files = by_stem(_masks(folder)).get(name), {} if own is None else by_stem(_masks(own))
+    always, files = lasting_mask(folder, name), {} if own is None else by_stem(_masks(own))
     numbers = _frame_numbers(source, name) if files else {}
     is_named = isinstance(innermost(source), ImageSource)  # frames of videos have no names
     if not is_named:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
     if files and not frames:
-        expected = f"{next(iter(numbers))}.png" if is_named else "000000.png, the frame's number in the video, from 0"
+        expected = (
+            f"{next(iter(numbers), '000000')}.png"
+            if is_named
+            else "000000.png, the frame's number in the video, from 0"
+        )
         raise CaptureError(
             f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
             f"expected names such as {expected}."

@@ -73,7 +73,7 @@ class GroupBase:
     @property
     def key_interval(self) -> int:
         """Frames from one key packet to the next."""
-        return max(1, round(self.header.fps * self.config.key_interval_seconds))
+        return self.config.key_interval(self.header.fps)
 
     @property
     def position_step(self) -> float:

@@ -39,10 +39,15 @@ def checked_address(host: str, *, tokens: bool, public: bool) -> str:
 
 
 def accepted_hosts(address: str, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Host names that requests may have: this machine's and ``names``; any for a public address without names."""
+    """Host names that requests may have: this machine's, the address and ``names``; any for a public address without
+    names."""
     if not names and not ipaddress.ip_address(address).is_loopback:
         return ("*",)
-    return (*LOOPBACK_NAMES, *names)
+    return tuple(dict.fromkeys((*LOOPBACK_NAMES, _in_url(address), *(name.lower() for name in names))))
+
+
+def _in_url(address: str) -> str:
+    return f"[{address}]" if ":" in address else address
 
 
 def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
@@ -98,7 +103,7 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
         server_header=False,
         proxy_headers=bool(proxies),
         forwarded_allow_ips=list(proxies),
-        limit_concurrency=connections,
+        limit_concurrency=None if connections is None else connections + 1,  # uvicorn refuses from its limit on
         h11_max_incomplete_event_size=MAX_HEADER_BYTES,
         timeout_keep_alive=KEEP_ALIVE_SECONDS,
         timeout_graceful_shutdown=SHUTDOWN_SECONDS,
@@ -110,8 +115,7 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
     """Serve until Ctrl-C or SIGTERM; ``on_start`` is called with the server's address once the port is bound. Raises
     PlayerError if the port is taken, or may not be used."""
     with bound(port, address=address) as listening:
-        name = f"[{address}]" if ":" in address else address
-        on_start(f"http://{name}:{listening.getsockname()[1]}/")
+        on_start(f"http://{_in_url(address)}:{listening.getsockname()[1]}/")
         with suppress(KeyboardInterrupt):  # uvicorn shuts down on Ctrl-C and then raises it again.
             server.run(sockets=[listening])
 

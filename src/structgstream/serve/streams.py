@@ -14,6 +14,7 @@ writer.
 """
 
 import errno
+import logging
 import os
 import re
 import stat
@@ -33,7 +34,10 @@ from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES,
 from structgstream.codec.segments.store import is_ours
 from structgstream.errors import PlayerError, StreamError
 
+log = logging.getLogger(__name__)
+
 STREAM_SUFFIX: Final = ".sgs"
+PLAIN: Final = "names of streams are up to 128 of A-Z a-z 0-9 . - _, without a dot first"
 
 _STREAM = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
 _PATH = re.compile(rb"/[A-Za-z0-9._/-]*")
@@ -154,10 +158,11 @@ class ServedStream:
 class Catalog:
     """The streams of a folder, listed again when the last listing is a second old.
 
-    A folder of segments, or of renditions, is one stream: itself.
+    A folder of segments, or of renditions, is one stream: itself. A stream of another name than Note [Plain names] says
+    is left out, with a warning.
 
     Raises:
-        PlayerError: it is no folder, or cannot be read.
+        PlayerError: it is no folder, cannot be read, or is itself a stream of such a name.
     """
 
     def __init__(self, folder: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -168,7 +173,10 @@ class Catalog:
         self._lock = threading.Lock()
         self._listed_at = -float("inf")
         self._found: Mapping[str, ServedStream] = {}
+        self._left_out: set[str] = set()
         try:
+            if not is_stream_name(self._folder.name) and self._itself() is not None:
+                raise PlayerError(f"The stream {folder} cannot be served, because {PLAIN}; rename it.")
             self.found()
         except OSError as error:
             raise PlayerError(f"The folder {folder} cannot be read ({error.strerror}).") from None
@@ -181,14 +189,20 @@ class Catalog:
                 self._listed_at = self._clock()
             return self._found
 
+    def _itself(self) -> ServedStream | None:
+        return _in_folder(self._folder.parent, self._folder.name) if self._folder.name else None
+
     def _list(self) -> Mapping[str, ServedStream]:
-        itself = _in_folder(self._folder.parent, self._folder.name) if self._folder.name else None
-        if itself is not None:
+        if (itself := self._itself()) is not None:
             found = [itself]
         else:
             with os.scandir(self._folder) as entries:
                 streams = [_stream(self._folder, entry) for entry in islice(entries, MAX_ENTRIES)]
             found = sorted(filter(None, streams), key=lambda one: one.name)
+        for one in found:
+            if not is_stream_name(one.name) and one.name not in self._left_out:
+                self._left_out.add(one.name)
+                log.warning("The stream %r is not served, because %s; rename it.", one.name, PLAIN)
         return {one.name: one for one in found if is_stream_name(one.name)}
 
 

@@ -39,7 +39,7 @@ from structgstream.session.pipeline import (
     StoredStream,
     StreamFacts,
 )
-from structgstream.session.presets import completed
+from structgstream.session.presets import StreamConfig, completed
 from structgstream.session.rate_control import RateController
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
@@ -82,7 +82,7 @@ class Session(Generic[State, Memory]):
         self._backend = backend
         self._resumed = resumed if resumed is not None and len(resumed) else None
         self._on_step = on_step
-        self._similarity = normalizing_similarity(source.rig, radius=pipeline.normalised_radius)
+        self._similarity = normalizing_similarity(source.rig, radius=StreamConfig.NORMALISED_RADIUS)
         self._rig = self._similarity.rig(source.rig)
         self._roving = roving_of(source)
         roving = {} if self._roving is None else {"roving": len(self._roving.pictures)}

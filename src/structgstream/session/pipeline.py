@@ -212,7 +212,6 @@ class Pipeline(Generic[State, Memory]):
         codec: stores frames.
         config: the resolved configuration as plain JSON values: the header's ``config``.
         seed: seed of all random numbers.
-        normalised_radius: largest distance of a training camera to their mean after normalisation.
         points: configuration of initial points, for captures without points.
         rate: configuration of the rate control.
         metadata: plain JSON values for every header.
@@ -226,7 +225,6 @@ class Pipeline(Generic[State, Memory]):
     codec: StreamCodec[State]
     config: Mapping[str, Any]
     seed: int
-    normalised_radius: float
     points: PointsConfig
     rate: RateConfig = field(default_factory=RateConfig)
     metadata: Mapping[str, Any] = field(default_factory=dict)

@@ -149,6 +149,10 @@ class StreamConfig:
     def __post_init__(self) -> None:
         check_numbers(self)
 
+    def key_interval(self, fps: float) -> int:
+        """Frames from one key packet to the next; at least 2 with a target rate, as that is met by delta packets."""
+        return max(1 if self.rate.target_mbits is None else 2, round(fps * self.key_interval_seconds))
+
 
 def to_json(config: StreamConfig) -> dict[str, Any]:
     """The resolved configuration as plain JSON values: what a stream's header stores."""

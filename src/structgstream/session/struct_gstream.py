@@ -67,7 +67,7 @@ class SceneCodec:
 
     def key_interval(self, fps: float) -> int:
         """Frames from one key packet to the next."""
-        return max(1, round(fps * self.config.key_interval_seconds))
+        return self.config.key_interval(fps)
 
     def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[FileSink, StreamReader | None]:
         """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
@@ -281,7 +281,6 @@ def stream_pipeline(
         SceneCodec(config),
         config=to_json(config),
         seed=config.seed,
-        normalised_radius=config.NORMALISED_RADIUS,
         points=config.points,
         rate=config.rate,
         period=config.period,

@@ -73,6 +73,11 @@ class Received:
         return [round((b - a) / PERIOD) for a, b in itertools.pairwise(times)]
 
 
+def clock(base: TimeBase, *, offset_seconds: float = 0.0) -> ClockMapper:
+    """The clock of a camera alone."""
+    return ClockMapper(base, resets=ClockResets(), offset_seconds=offset_seconds)
+
+
 def camera_feed(
     received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, **opening: Any
 ) -> tuple[CameraFeed, FaultLog]:
@@ -83,7 +88,7 @@ def camera_feed(
         camera,
         size=(128, 96),
         receiver=received,
-        clock=ClockMapper(base),
+        clock=clock(base),
         faults=faults,
         base=base,
         now=lambda: next(ticks) * PERIOD / 2,
@@ -153,6 +158,68 @@ def test_lost_datagrams_are_a_damage() -> None:
     assert received.numbers == [n % 12 for n in (round((p.seconds - 1000) / PERIOD) for p in received.pictures)]
     assert faults["garbage"] >= 1
     assert 40 <= len(received.pictures) < 60
+
+
+class Packets:
+    """Notes what is to be recorded of a camera."""
+
+    def __init__(self) -> None:
+        self.found: list[tuple[Any, float]] = []
+
+    def record(self, packet: Any, *, shift_seconds: float) -> None:
+        self.found.append((packet, shift_seconds))
+
+    def shown(self) -> Received:
+        """Its pictures, decoded again, at the times of their packets."""
+        received, decoder = Received(), av.CodecContext.create("h264", "r")
+        seconds = {packet.pts: float(packet.pts * packet.time_base) + shift for packet, shift in self.found}
+        for packet in (*(packet for packet, _ in self.found), None):
+            for frame in decoder.decode(packet):  # type: ignore[attr-defined]
+                received.deliver("a", LivePicture(seconds[frame.pts], 0.0, frame))
+        return received
+
+
+def with_b_frames(x264: str, first: int = 0) -> bytes:
+    """Five groups of 12 pictures of the film from number ``first`` on."""
+    written = io.BytesIO()
+    with av.open(written, "w", format="mpegts") as output:
+        options = {"x264-params": f"keyint=12:min-keyint=12:scenecut=0:b-adapt=0:{x264}"}
+        stream = output.add_stream("libx264", rate=30, options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        for number in range(first, first + 60):
+            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return written.getvalue()
+
+
+@pytest.mark.parametrize("base", [TimeBase.STREAM, TimeBase.ARRIVAL])
+@pytest.mark.parametrize("x264", ["bframes=0", "bframes=3", "bframes=3:open-gop=1"])
+def test_what_is_recorded_after_a_loss_begins_with_a_key_frame(x264: str, base: TimeBase) -> None:
+    """Decoders give pictures back some packets later, where B-frames refer to pictures after them."""
+    stream, packets, received = with_b_frames(x264), Packets(), Received()
+    middle = len(stream) // 3 // 188 * 188
+    waiting = [stream[:middle] + stream[middle + 188 * 3 :], with_b_frames(x264, first=240)]
+    feed, _ = camera_feed(
+        received,
+        base=base,
+        open_camera=lambda camera, timeout: closing(av.open(io.BytesIO(waiting.pop(0)))),
+        wait=lambda seconds: None if waiting else feed.stop(),
+        recorder=packets,
+    )
+    feed.start()
+    feed.join(WAIT)
+    recorded = packets.shown()
+    assert 90 < len(recorded.pictures) <= len(received.pictures) < 120
+    if base is TimeBase.STREAM:
+        first = recorded.pictures[0].seconds
+        assert recorded.numbers == [round((one.seconds - first) / PERIOD) % 12 for one in recorded.pictures]
+        assert {one.seconds for one in recorded.pictures} <= {one.seconds for one in received.pictures}
+    else:
+        assert len(recorded.numbers) == len(recorded.pictures)
+        assert all(np.isfinite(shift) for _, shift in packets.found)
 
 
 def test_a_picture_of_other_proportions_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
@@ -374,9 +441,9 @@ def test_arrival_keeps_the_spacing_of_the_stamps_in_spite_of_jitter() -> None:
     """The least delay wins: after the first pictures, times lie where the quickest network would have put them."""
     stamps = np.arange(300) * PERIOD
     jitter = np.random.default_rng(0).uniform(0, 0.05, 300)
-    times = placed(ClockMapper(TimeBase.ARRIVAL), stamps, UNIX + stamps + 0.02 + np.maximum.accumulate(jitter * 0))
+    times = placed(clock(TimeBase.ARRIVAL), stamps, UNIX + stamps + 0.02 + np.maximum.accumulate(jitter * 0))
     assert times == pytest.approx(list(UNIX + stamps + 0.02), abs=1e-6)
-    late = placed(ClockMapper(TimeBase.ARRIVAL), stamps, np.maximum.accumulate(UNIX + stamps + 0.02 + jitter))
+    late = placed(clock(TimeBase.ARRIVAL), stamps, np.maximum.accumulate(UNIX + stamps + 0.02 + jitter))
     errors = np.array(late[60:]) - (UNIX + stamps + 0.02)[60:]
     assert errors.min() > -1e-6
     assert errors.max() < 0.005  # the least of 60 uniform values of 50 ms
@@ -388,7 +455,7 @@ def test_pictures_that_were_held_back_are_no_jump() -> None:
     arrivals = np.maximum(UNIX + stamps, UNIX + np.where((stamps > 3) & (stamps < 7), 7, 0))
     arrivals = np.maximum.accumulate(arrivals + 1e-4 * np.arange(300))
     for base in (TimeBase.ARRIVAL, TimeBase.STREAM):
-        mapper = ClockMapper(base)
+        mapper = clock(base)
         found = [mapper.map(stamp, arrived=at) for stamp, at in zip(stamps, arrivals, strict=True)]
         assert [item.fault for item in found] == [None] * 300
         assert np.allclose(np.diff(seconds_of(found)), PERIOD, atol=2e-4)
@@ -397,18 +464,18 @@ def test_pictures_that_were_held_back_are_no_jump() -> None:
 def test_a_clock_that_runs_fast_is_followed_by_arrival() -> None:
     stamps = np.arange(0, 3600, 0.5)
     arrivals = UNIX + stamps / 1.0002  # 0.7 s an hour
-    times = placed(ClockMapper(TimeBase.ARRIVAL), stamps, arrivals)
+    times = placed(clock(TimeBase.ARRIVAL), stamps, arrivals)
     assert np.abs(np.array(times) - arrivals).max() < 0.008
 
 
 def test_stream_takes_stamps_and_offsets() -> None:
-    assert placed(ClockMapper(TimeBase.STREAM, offset_seconds=-0.25), [5.0, 5.5], [UNIX, UNIX + 0.5]) == [4.75, 5.25]
+    assert placed(clock(TimeBase.STREAM, offset_seconds=-0.25), [5.0, 5.5], [UNIX, UNIX + 0.5]) == [4.75, 5.25]
 
 
 @pytest.mark.parametrize("jump", [100.0, -100.0, 1e6, -1.5])
 @pytest.mark.parametrize("base", TimeBase)
 def test_after_a_jump_pictures_go_on_as_late_as_before(base: TimeBase, jump: float) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     before, after = np.arange(90) * PERIOD, np.arange(90, 180) * PERIOD
     start = placed(mapper, before, UNIX + before + 0.03)
     found = mapper.map(after[0] + jump, arrived=UNIX + after[0] + 0.034)
@@ -437,7 +504,7 @@ def test_cameras_whose_common_clock_is_set_stay_in_step_exactly() -> None:
 @pytest.mark.parametrize("base", TimeBase)
 @pytest.mark.parametrize("stamp", [0.0, 3.0, 5000.0])
 def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     placed(mapper, np.arange(91) * PERIOD, UNIX + np.arange(91) * PERIOD)
     mapper.reconnect()
     found = [mapper.map(stamp + t, arrived=UNIX + 10 + t) for t in np.arange(30) * PERIOD]
@@ -449,7 +516,7 @@ def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float)
 
 
 def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
-    mapper = ClockMapper(TimeBase.STREAM)
+    mapper = clock(TimeBase.STREAM)
     stamps = [0.0, 0.1, 0.1, 0.3, 0.2, 0.4]
     found = [mapper.map(stamp, arrived=UNIX + 0.1 * n) for n, stamp in enumerate(stamps)]
     assert [item.fault for item in found] == [None, None, Fault.DUPLICATE, None, Fault.REORDERED, None]
@@ -458,7 +525,7 @@ def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
 
 @pytest.mark.parametrize("base", TimeBase)
 def test_stamps_of_33_bits_wrap(base: TimeBase) -> None:
-    mapper = ClockMapper(base)
+    mapper = clock(base)
     true = WRAP - 1 + np.arange(60) * PERIOD
     found = [mapper.map(t % WRAP, arrived=UNIX + t, wrap_seconds=WRAP) for t in true]
     assert {item.fault for item in found} == {None}
@@ -466,7 +533,7 @@ def test_stamps_of_33_bits_wrap(base: TimeBase) -> None:
 
 
 def test_unix_stamps_are_found_again_from_33_bits() -> None:
-    mapper = ClockMapper(TimeBase.UNIX)
+    mapper = clock(TimeBase.UNIX)
     true = UNIX + np.arange(10) * PERIOD
     times = placed(mapper, true % WRAP, true + 0.2, wrap_seconds=WRAP)
     assert times == pytest.approx(list(true), abs=1e-5)
@@ -479,7 +546,7 @@ def test_unix_stamps_are_found_again_from_33_bits() -> None:
 )
 @examples(150)
 def test_times_rise_whatever_comes(base: TimeBase, steps: list[tuple[float, float]]) -> None:
-    mapper, stamp, arrived, last = ClockMapper(base), 0.0, UNIX, -np.inf
+    mapper, stamp, arrived, last = clock(base), 0.0, UNIX, -np.inf
     for by, wait in steps:
         stamp, arrived = stamp + by, arrived + wait
         seconds = mapper.map(stamp, arrived=arrived, wrap_seconds=WRAP).seconds

@@ -28,6 +28,7 @@ from structgstream.data.source import frame_count, is_recording
 from structgstream.data.video import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.opus import PACKET_SECONDS
+from tests.support.captures import write_picture
 from tests.support.rigs import arc_rig
 from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream
 from tests.support.sounds import add_sound, claps, packets_heard
@@ -282,6 +283,23 @@ def test_what_is_recorded_is_a_capture_of_the_same_instants(tmp_path: Path) -> N
     assert 0 < len((folder / "frames.jsonl").read_text().splitlines()) == len(live)
 
 
+def test_masks_of_the_calibration_count_live_and_in_the_recording(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those for all frames, of cameras that are used."""
+    path, folder, masks = files(tmp_path), tmp_path / "take", tmp_path / "calibration" / "masks"
+    head, _, rest = path.read_text().partition("[cameras.a]")
+    path.write_text(f'without = ["a"]\n{head}{rest[rest.index("[cameras.b]") :]}')
+    left = np.broadcast_to(np.arange(128) < 64, (96, 128))
+    for file in ("a.png", "b.png", "c/000000.png"):
+        write_picture(masks / file, np.repeat(left[..., None], 3, axis=2).astype(np.uint8) * 255)
+    live = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
+    for frame in (*live, *open_capture(folder).frames()):
+        assert [*frame.masks] == ["b"]
+        np.testing.assert_array_equal(frame.masks["b"], left)
+    assert "the masks of single frames of camera 'c' are not used: it is live" in caplog.text
+
+
 def test_pictures_of_other_proportions_are_not_recorded(tmp_path: Path) -> None:
     path, folder = files(tmp_path, frames=48, c="shape:0.4:0.4"), tmp_path / "take"
     list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
@@ -336,7 +354,7 @@ def record(recorder: recording.CameraRecorder, stream: bytes) -> None:
 
 def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tmp_path: Path) -> None:
     folder = tmp_path / "take"
-    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS)
+    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS, masks=tmp_path)
     recorders = {name: kept.camera(name, FaultLog("rig", now=lambda: 0.0)) for name in NAMES}
     for first in range(0, 48, 12):
         for name in ("b", "a", "c"):
@@ -406,14 +424,24 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
     assert source.faults.counts["b"] == {"garbage": 1}
 
 
-def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
-    path, folder = files(tmp_path), tmp_path / "take"
-    options = LiveOptions(record=folder, frames=6)
-    list(LiveSource(path, tmp_path / "x.sgs", options).frames())
-    before = (folder / "a.ts").read_bytes()
-    list(LiveSource(path, tmp_path / "y.sgs", options).frames())
-    assert (folder / "a.ts").read_bytes() == before
-    assert len(open_capture(folder / "part-001")) >= 5
+@pytest.mark.parametrize(
+    ("existing", "parts"), [("take/a.ts", ["part-001", "part-002"]), ("take/part-003/a.ts", ["part-004"])]
+)
+def test_a_recording_replaces_nothing(
+    tmp_path: Path, existing: str, parts: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not even the film of its own cameras, or an earlier recording."""
+    path, folder, film = files(tmp_path), tmp_path / "take", tmp_path / existing
+    film.parent.mkdir(parents=True)
+    (tmp_path / "a.ts").rename(film)
+    path.write_text(path.read_text().replace('"a.ts"', f'"{existing}"'))
+    before = film.read_bytes()
+    for part in parts:
+        options = LiveOptions(record=folder, frames=6)
+        list(LiveSource(path, tmp_path / f"{part}.sgs", options).frames())
+        assert len(open_capture(folder / part)) >= 5
+        assert f"{folder} is not empty; the recording goes to {folder / part}" in caplog.text
+    assert film.read_bytes() == before
 
 
 def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:

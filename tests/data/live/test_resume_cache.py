@@ -23,7 +23,7 @@ from structgstream.frames import MultiViewFrame
 
 def some_frame(index: int = 7) -> MultiViewFrame:
     random = np.random.default_rng(index)
-    images = {name: random.integers(0, 256, (12, 16 + n, 3)).astype(np.uint8) for n, name in enumerate("ab")}
+    images = {name: random.integers(0, 256, (12, 16 + n, 3)).astype(np.uint8) for n, name in enumerate("abc")}
     return MultiViewFrame(index, 0.25, images, {"b": random.random((12, 17)) < 0.5}, 1.7e9)
 
 
@@ -33,8 +33,8 @@ def test_pictures_masks_and_times_come_back(tmp_path: Path) -> None:
     read, origin = read_pictures(path)
     assert (read.index, read.pts_seconds, read.captured_unix_seconds) == (7, 0.25, 1.7e9)
     assert origin == 4.5
-    assert [*read.images] == ["a", "b"]
-    assert all((read.images[name] == frame.images[name]).all() for name in "ab")
+    assert [*read.images] == ["a", "b", "c"]
+    assert all((read.images[name] == frame.images[name]).all() for name in "abc")
     assert (read.masks["b"] == frame.masks["b"]).all()
     assert read.masks["b"].dtype == bool
 
@@ -93,7 +93,7 @@ def frame(index: int) -> MultiViewFrame:
 
 
 def cache(folder: Path, *, resume: bool = False) -> ResumeCache:
-    return ResumeCache(folder, cameras=("a",), resume=resume)
+    return ResumeCache(folder, cameras=("a", "b"), resume=resume)
 
 
 def test_the_folder_lies_beside_the_stream() -> None:
@@ -109,7 +109,7 @@ def test_frame_0_and_the_last_frames_are_kept_and_no_more(tmp_path: Path) -> Non
     assert [one.index for one in again.frames(18)] == [18, 19]
     first = next(again.frames(0))
     assert (first.images["a"] == frame(0).images["a"]).all()
-    assert [*first.images] == ["a"]  # no held-out camera
+    assert [*first.images] == ["a", "b"]  # no held-out camera
     assert again.last() == (19 / 4, 100.0)
     assert list(again.frames(20)) == []
 
@@ -128,7 +128,7 @@ def test_of_a_frame_that_shows_nothing_the_noise_is_not_kept(tmp_path: Path) -> 
     frames, sizes = cache(tmp_path / "x.live"), []
     noise = np.random.default_rng(0).integers(7, 10, (480, 640, 3), dtype=np.uint8)
     for index, image in enumerate((noise, noise, 20 * noise)):
-        frames.store(MultiViewFrame(index, index / 4, {"a": image}), origin_seconds=0.0)
+        frames.store(MultiViewFrame(index, index / 4, dict.fromkeys("ab", image)), origin_seconds=0.0)
         sizes.append((tmp_path / "x.live" / f"frame-{index:08d}.pictures").stat().st_size)
     assert 50 * sizes[1] < sizes[2]
     assert not next(cache(tmp_path / "x.live", resume=True).frames(1)).showing(["a"])

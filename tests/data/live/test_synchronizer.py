@@ -98,6 +98,42 @@ def test_when_the_leader_goes_another_camera_leads() -> None:
     assert [len(one.pictures) for sets in found for one in sets] == [2] * 39
 
 
+@pytest.mark.parametrize("fps", [0.5, 1.0])
+def test_slow_cameras_are_present_between_their_pictures(fps: float) -> None:
+    """Their latencies differ by more than a tick, and by less than the deadline."""
+    rig = Rig("a", "b", fps=fps, tolerance=0.5 / fps)
+    found = []
+    for second in range(20):
+        rig.send("a", second / fps, arrived=second / fps + 0.05)
+        found += rig.sets(second / fps + 0.3)
+        rig.send("b", second / fps, arrived=second / fps + 0.4)
+        found += rig.sets(second / fps + 0.4)
+    assert [len(one.pictures) for one in found[1:]] == [2] * (len(found) - 1)
+    assert len(found) >= 19
+
+
+def test_a_camera_whose_clock_is_ahead_and_that_leads_once_does_not_stop_the_others() -> None:
+    rig, found = Rig("a", "b", "c"), []
+    for number in range(120):
+        now = number * PERIOD
+        for camera in "abc" if number >= 30 else "c":
+            rig.send(camera, now + 3600.0 * (camera == "c"), arrived=now)
+        found += rig.sets(now)
+    assert [[*one.pictures] for one in found] == [["c"]] * 30 + [["a", "b"]] * 90
+    times = [one.seconds for one in found[30:]]
+    assert times == sorted(times)
+
+
+def test_late_pictures_of_a_camera_that_begins_to_lead_are_no_set() -> None:
+    rig = Rig("a", "b", deadline=0.2)
+    for number in range(60):
+        rig.send("a", number * PERIOD)
+        rig.sets(number * PERIOD)
+    rig.synchronizer.mark_absent("a")
+    rig.send("b", 0.0, arrived=2.0)
+    assert rig.sets(2.0) == []
+
+
 @pytest.mark.parametrize("phases", [(0, 0.3, 0.9), (0, 0.49, 0.51), (0.9, 0.1, 0.5)])
 def test_cameras_of_any_phase_are_in_every_set(phases: tuple[float, ...]) -> None:
     rig = Rig("a", "b", "c")

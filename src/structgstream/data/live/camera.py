@@ -103,9 +103,8 @@ class ClockMapper:
     ``offset_seconds`` is added to every time.
     """
 
-    def __init__(self, base: TimeBase, *, offset_seconds: float = 0.0, resets: ClockResets | None = None) -> None:
-        self._base, self._offset = base, offset_seconds
-        self._resets = ClockResets() if resets is None else resets
+    def __init__(self, base: TimeBase, *, resets: ClockResets, offset_seconds: float = 0.0) -> None:
+        self._base, self._resets, self._offset = base, resets, offset_seconds
         self._delay = MinimumDelayFilter()
         self._stamp: float | None = None
         self._seconds = -float("inf")
@@ -177,6 +176,7 @@ MPEGTS_STAMPS = 2**33
 MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 MAX_SOUND_APART_SECONDS = 10.0
 """Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
+MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
@@ -246,6 +246,8 @@ class CameraFeed:
         self._checksum: int | None = None
         self._damaged, self._decodes = True, False
         self._before: Packet | None = None
+        self._held: list[Packet] = []  # to be recorded when their pictures come, which B-frames delay
+        self._whole = False  # whether everything from a key packet on was held
         self._gone_since: float | None = None
         self._paced: float | None = None
         self._unstamped = 0
@@ -307,7 +309,7 @@ class CameraFeed:
         self._clock.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
-        self._before = None
+        self._before, self._held, self._whole = None, [], False
         for packet in container.demux(stream, *self._sound_streams(container)):
             if self._stop.is_set():
                 return
@@ -316,13 +318,34 @@ class CameraFeed:
                 continue
             if self._is_duplicate(packet):
                 continue
-            shift = None
+            self._hold(packet)
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
-                shift = self._picture(frame, wrap)
-            usable = self._usable and not self._damaged and not packet.is_corrupt
-            if self._recorder is not None and packet.size and usable:
-                self._recorder.record(packet, shift_seconds=self._clock.shift if shift is None else shift)
+                self._record(frame, shift_seconds=self._picture(frame, wrap))
+
+    def _hold(self, packet: "Packet") -> None:
+        """Holds a packet that may be recorded, after damage from the next key packet on."""
+        self._whole |= packet.is_keyframe
+        if self._recorder is None or not packet.size or not self._whole:
+            return
+        self._held.append(packet)
+        if len(self._held) > MAX_HELD:
+            self._forget()
+
+    def _forget(self, picture: int | None = None) -> None:
+        """Drops what is held, after damage; ``picture`` is the stamp of a broken picture, and what is held from a key
+        packet after it on remains."""
+        stamps = [one.pts if one.is_keyframe else None for one in self._held]
+        after = (n for n, pts in enumerate(stamps) if picture is not None and pts is not None and pts > picture)
+        self._held = self._held[next(after, len(stamps)) :]
+        self._whole = bool(self._held)
+
+    def _record(self, frame: "VideoFrame", *, shift_seconds: float) -> None:
+        """Records the packets of all pictures up to this one: only now it is known what is in them, and when."""
+        while self._held and _is_of(self._held[0], frame):
+            packet = self._held.pop(0)
+            if self._recorder is not None and self._usable:
+                self._recorder.record(packet, shift_seconds=shift_seconds)
 
     def _sound_streams(self, container: Any) -> list[Any]:
         """The stream of sound to read; none where sound is not wanted, or not sent."""
@@ -370,13 +393,16 @@ class CameraFeed:
             return
         for frame in frames:
             if frame.is_corrupt:
-                self._report_damage("a frame is broken")
+                self._report_damage("a frame is broken", picture=frame.pts)
             elif not self._damaged or frame.key_frame:
+                if self._damaged:  # Pictures before a key frame that come after it refer to what is damaged.
+                    self._held = [one for one in self._held if one.is_keyframe or not _is_of(one, frame)]
                 self._damaged, self._decodes = False, True
                 yield frame
 
-    def _report_damage(self, reason: str) -> None:
+    def _report_damage(self, reason: str, *, picture: int | None = None) -> None:
         self._damaged = True
+        self._forget(picture)
         if not self._decodes:
             return
         self._receiver.mark_absent(self.name)
@@ -498,6 +524,11 @@ def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContex
     # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
     timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
     return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
+
+
+def _is_of(packet: "Packet", picture: "VideoFrame") -> bool:
+    """Whether a packet is of a picture or one before it, by their stamps."""
+    return packet.pts is None or (picture.pts is not None and packet.pts <= picture.pts)
 
 
 def picture_checksum(frame: "VideoFrame") -> int:

@@ -157,7 +157,7 @@ class Ingest:
 
     @property
     def present(self) -> list[str]:
-        """Cameras that sent a usable picture within the deadline."""
+        """Cameras that send usable pictures, the next of which is not later than the deadline."""
         with self._changed:
             return self._synchronizer.present(self._now())
 

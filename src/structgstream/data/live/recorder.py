@@ -4,8 +4,8 @@
 Each camera has a file: MPEG-TS for codecs that it supports, Matroska for others; both can be read up to where a crash
 truncated them. Time stamps are those of the common clock, less its value at the start, so that a camera that
 reconnected or whose clock was reset stays synchronised; pictures are not encoded again. ``capture.json`` makes the
-folder a prepared capture of the cameras that sent something. Damaged packets, and pictures of another size, are not
-recorded.
+folder a prepared capture of the cameras that sent something. Damaged packets, those after them up to the next key
+packet, and pictures of other proportions are not recorded.
 
 A file has one codec, and time stamps of MPEG-TS wrap after 26 hours. After :data:`PART_SECONDS`, and when a camera
 returns with another codec, size or parameters, every camera continues, at its next key frame, in the folder
@@ -14,6 +14,7 @@ returns with another codec, size or parameters, every camera continues, at its n
 
 import json
 import logging
+import re
 import threading
 from bisect import bisect_right
 from collections.abc import Mapping
@@ -23,8 +24,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from structgstream.atomic_files import atomic_write
 from structgstream.data.live.status import FaultLog
-from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
+from structgstream.data.masks import FOLDER, lasting_mask
+from structgstream.data.prepared import PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
@@ -43,23 +46,26 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
 
 class Recording:
-    """The folder of a recording, which is made; a recording in it is continued in its next part.
+    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part.
+
+    Args:
+        masks: folder of masks of the calibration; those for all frames are copied.
 
     Raises:
         StorageError: it cannot be written, here or later.
     """
 
-    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float) -> None:
-        self._folder, self._calibration, self._fps = folder, calibration, fps
+    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, masks: Path) -> None:
+        self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
         self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.RLock()
-        self._first = 0
-        while (_part(folder, self._first) / FILE).exists():
-            self._first += 1
+        self._first = _first_part(folder)
         self._files: dict[int, dict[str, str]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
-        self.folder(0, {})
+        made = self.folder(0, {})
+        if self._first:
+            log.warning("%s is not empty; the recording goes to %s", folder, made)
 
     def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
         """The recorder of a camera."""
@@ -107,6 +113,9 @@ class Recording:
             }
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
             write_prepared(folder, capture.only(known) if known else capture)
+            for name in files:
+                if (mask := lasting_mask(self._masks, name)) is not None:
+                    atomic_write(folder / FOLDER / f"{name}.png", mask.read_bytes(), called="The mask", new_folder=True)
             return folder
 
     def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
@@ -236,3 +245,13 @@ def _codec(stream: Any) -> tuple[object, ...]:
 
 def _part(folder: Path, number: int) -> Path:
     return folder if number == 0 else folder / f"part-{number:03d}"
+
+
+def _first_part(folder: Path) -> int:
+    """The number of the first part of another recording in a folder: nothing is in it, nor in those that follow."""
+    try:
+        entries = [entry.name for entry in folder.iterdir()] if folder.exists() else []
+    except OSError as error:
+        raise StorageError(f"The folder {folder} cannot be read ({error.strerror}).") from None
+    parts = (re.fullmatch(r"part-(\d{3,})", name) for name in entries)
+    return 1 + max((int(part[1]) for part in parts if part), default=0) if entries else 0

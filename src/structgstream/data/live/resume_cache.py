@@ -70,7 +70,7 @@ class ResumeCache:
         """Stores a frame's pictures, and removes those that are no longer needed; ``origin_seconds`` is the common
         clock at presentation time 0."""
         images = {name: image for name, image in frame.images.items() if name in self._cameras}
-        if len(frame.showing(self._cameras)) < min(MIN_CAMERAS, len(self._cameras)):  # nothing is visible
+        if len(frame.showing(self._cameras)) < MIN_CAMERAS:  # nothing is visible
             images = {name: np.zeros_like(image) for name, image in images.items()}
         masks = {name: mask for name, mask in frame.masks.items() if name in self._cameras}
         own_folder(self._folder, FOLDER_PURPOSE)
@@ -137,7 +137,7 @@ def write_pictures(path: Path, frame: MultiViewFrame, *, origin_seconds: float) 
     header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,
               "captured_unix_seconds": frame.captured_unix_seconds, "origin_seconds": origin_seconds,
               **entries}  # fmt: skip
-    atomic_write(path, [json.dumps(header).encode() + b"\n", *packed], called="The pictures", sync=True)
+    atomic_write(path, [json.dumps(header).encode() + b"\n", *packed], called="The pictures")
 
 
 def read_pictures(path: Path) -> tuple[MultiViewFrame, float]:

@@ -87,10 +87,11 @@ def with_calibration(
     held_out: tuple[str, ...] | None,
     scale: float,
     near: float | None,
+    without: tuple[str, ...] = (),
 ) -> FrameSource:
     """Live ``pictures`` of ``prepared.filmed_rig``, undistorted and masked as those of a prepared capture in ``folder``
-    are; other arguments as of ``open_capture``."""
-    source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER)
+    are, which has cameras that ``capture`` is ``without``; other arguments as of ``open_capture``."""
+    source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER, without=without)
     return selected(source, held_out=held_out, scale=scale, near=near)
 
 
@@ -292,6 +293,7 @@ class LiveSource:
             held_out=options.held_out,
             scale=options.scale,
             near=options.near,
+            without=self._live.without,
         )
 
     def _arriving(self, ingest: Ingest, *, is_first: bool) -> Iterator[MultiViewFrame]:
@@ -333,7 +335,8 @@ class LiveSource:
     def _running(self) -> Iterator[tuple[Ingest, Recording | None]]:
         recording = None
         if self._options.record is not None:
-            recording = Recording(self._options.record, self._calibration, fps=self.fps)
+            masks = self._live.calibration / FOLDER
+            recording = Recording(self._options.record, self._calibration, fps=self.fps, masks=masks)
         ingest = self._ingest = Ingest(
             self._live,
             sizes=filmed_sizes(self._calibration),

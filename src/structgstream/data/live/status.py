@@ -73,7 +73,7 @@ class FaultLog:
 class CameraStatus:
     """State of a camera."""
 
-    present: bool = False  # whether it sent a usable picture within the deadline
+    present: bool = False  # whether it sends usable pictures, the next of which is not later than the deadline
     decoded: int = 0  # number of decoded pictures
     queued: int = 0  # number of pictures that wait to be matched
     faults: Mapping[str, int] = field(default_factory=dict)  # number of occurrences by kind

@@ -7,6 +7,9 @@ The first camera that is present is the reference: each of its pictures is an in
 nearest picture within a tolerance. So cameras may run at any phase and at slightly different rates. A picture is in one
 set at most. A set is complete when each present camera has sent a picture at or after its instant, or when the deadline
 has passed since the reference picture arrived; cameras without a picture are absent from it.
+
+Instants increase, except where a camera whose clock is ahead led before the others came: pictures that are earlier than
+the last instant by more than :data:`MAX_LATE_SECONDS` are not late, and lead again.
 """
 
 from collections import deque
@@ -18,6 +21,8 @@ from structgstream.data.live.status import Fault
 
 MIN_SPACING = 0.75
 """Minimum share of a frame period between two instants: of a faster reference camera, pictures are left out."""
+MAX_LATE_SECONDS = 5.0
+"""Later than its reference no picture comes: a connection that stalls for so long is opened again."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ class FrameSynchronizer:
         tolerance_seconds: maximum distance of a picture from the instant.
         deadline_seconds: how long a set waits for its pictures.
         queue_frames: maximum number of waiting pictures of a camera; the oldest are dropped.
-        started: when the cameras were opened; until the deadline they count as present.
+        started: when the cameras were opened; they count as present as if they had sent a picture then.
     """
 
     def __init__(
@@ -77,6 +82,7 @@ class FrameSynchronizer:
         self._queues = {name: _Queue(last_arrived=started) for name in cameras}
         self._spacing = MIN_SPACING / fps
         self._tolerance, self._deadline = tolerance_seconds, deadline_seconds
+        self._present = deadline_seconds + 1 / fps  # from one picture to the next at most
         self._max_queue, self._count = queue_frames, count
         self._last = -float("inf")
 
@@ -94,8 +100,8 @@ class FrameSynchronizer:
         self._queues[camera].last_arrived = -float("inf")
 
     def present(self, now: float) -> list[str]:
-        """The cameras that sent a picture within the deadline, in the rig's order."""
-        return [name for name, queue in self._queues.items() if now - queue.last_arrived <= self._deadline]
+        """The cameras whose next picture is not later than the deadline, in the rig's order."""
+        return [name for name, queue in self._queues.items() if now - queue.last_arrived <= self._present]
 
     def out_of_step(self, sets: int) -> dict[str, float]:
         """Cameras that send but were in none of the last ``sets`` sets, and their distance from the last instant,
@@ -128,7 +134,7 @@ class FrameSynchronizer:
         # Pictures of cameras that have become absent still make sets, after those of present ones.
         for name in (*present, *(name for name in self._queues if name not in present)):
             pictures = self._queues[name].pictures
-            while pictures and pictures[0].seconds < self._last + self._spacing:
+            while pictures and -MAX_LATE_SECONDS < pictures[0].seconds - self._last < self._spacing:
                 self._drop_first(name)
             if pictures:
                 return pictures[0]

@@ -105,7 +105,6 @@ def peer_pipeline(method: PeerMethod[State, Memory], *, seed: int = 0) -> Pipeli
         PeerCodec(method),
         config=to_json(method.config),
         seed=seed,
-        normalised_radius=RIG.NORMALISED_RADIUS,
         points=RIG.points,
         metadata={"seed": seed},
     )
