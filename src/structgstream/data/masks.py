@@ -171,11 +171,9 @@ def _files(folder: Path, name: str, source: FrameSource, own: Path | None) -> Ca
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
     if files and not frames:
-        expected = (
-            f"{next(iter(numbers), '000000')}.png"
-            if is_named
-            else "000000.png, the frame's number in the video, from 0"
-        )
+        expected = "000000.png, the frame's number in the video, from 0"
+        if is_named:
+            expected = f"{next(iter(numbers), '000000')}.png"
         raise CaptureError(
             f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
             f"expected names such as {expected}."
