@@ -8,11 +8,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.open import open_capture
-from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized, section
+from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized_to, section
 from structgstream.data.video import VideoSource
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.report import FrameScores
@@ -91,13 +92,19 @@ def captures_of(
         CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
     whole = open_capture(folder, roving=False)  # they train frame 0, which the stream has
-    scale = _scale(header, whole)
-    return _part(resized(whole, scale), header, frames), _part(whole, header, frames) if scale < 1.0 else None
+    cameras = {name: _as_in(header.rig, name, camera) for name, camera in whole.rig.cameras.items()}
+    if all(cameras[name] is camera for name, camera in whole.rig.cameras.items()):
+        return _part(whole, header, frames), None
+    return _part(resized_to(whole, whole.rig.mapped(cameras)), header, frames), _part(whole, header, frames)
 
 
-def _scale(header: StreamHeader, whole: FrameSource) -> float:
-    shared = [name for name in header.rig if name in whole.rig.cameras]
-    return min(header.rig[shared[0]].width / whole.rig[shared[0]].width, 1.0) if shared else 1.0
+def _as_in(rig: CameraRig, name: str, camera: Camera) -> Camera:
+    """The capture's ``camera`` at its size in the stream's ``rig``, which is never enlarged. The stream's own numbers
+    are taken, because a scale that is found again from one rounded side may round the other differently."""
+    ours = rig.cameras.get(name, camera)
+    fits = ours.width <= camera.width and ours.height <= camera.height
+    is_smaller = fits and (ours.width, ours.height) != (camera.width, camera.height)
+    return camera.resized(ours.width, ours.height) if is_smaller else camera
 
 
 def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> FrameSource:
@@ -135,7 +142,8 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
         if (theirs.width, theirs.height) != (ours.width, ours.height):
             raise CaptureError(
                 f"Camera {name!r} has {theirs.width}x{theirs.height} pixels in the capture {source.name} and "
-                f"{ours.width}x{ours.height} in the stream; give the --scale of the reconstruction."
+                f"{ours.width}x{ours.height} in the stream; evaluate the stream on the capture it was made from, opened "
+                "at the same scale."
             )
         if not (torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4) and torch.allclose(theirs.K, ours.K, atol=0.1)):
             raise CaptureError(
