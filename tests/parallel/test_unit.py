@@ -60,8 +60,8 @@ def test_frame_0_may_be_resumed_and_all_segments_are_joined(tmp_path: Path, part
     given_unit = unit(tmp_path, header=("--preset", "tiny"))
     words = after(given_unit.header_task(parts).command, "reconstruct")
     assert words == [
-        str(tmp_path / "capture"), "-o", str(parts.header), "--frames", "1", "--resume", "--preset", "tiny",
-        "--device", "cpu",
+        str(tmp_path / "capture"), "-o", str(parts.header), "--frames", "1", "--resume", "--sound", "none",
+        "--preset", "tiny", "--device", "cpu",
     ]  # fmt: skip
     task = given_unit.join_task(parts, [(0, 8), (8, 16)], tmp_path / "out.sgs")
     found = parse_options(Join, "join", arguments=after(task.command, "join"))

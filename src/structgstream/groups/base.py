@@ -41,7 +41,7 @@ class GroupBase:
         if init is None or init.type != RecordType.INIT or first is None or first.type != RecordType.KEY:
             raise StreamError(
                 f"{path} has no whole frame 0 at its beginning; make it with: structgstream reconstruct CAPTURE "
-                f"--frames 1 -o {path} --overwrite"
+                f"--frames 1 --sound none -o {path} --overwrite"
             )
         head, record = bytes(data[: init.end]), bytes(data[init.end : first.end])
         data.close()
@@ -56,7 +56,7 @@ class GroupBase:
     @cached_property
     def config(self) -> StreamConfig:
         """The configuration of the stream, which is that of every group. Raises ConfigError if it cannot be read, has
-        periods, or was made without scene flow, which groups need."""
+        periods or sound, or was made without scene flow, which groups need."""
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
             raise ConfigError(
@@ -67,6 +67,11 @@ class GroupBase:
         if config.period.enabled:
             raise ConfigError(
                 f"{self.name} may begin other periods, and groups share one header; make it without them."
+            )
+        if self.header.sound is not None:
+            raise ConfigError(
+                f"{self.name} has sound, which groups do not carry; make it with --sound none, and give the joined "
+                "stream its sound with structgstream add-sound."
             )
         return config
 

@@ -62,7 +62,8 @@ class Unit:
     def header_task(self, parts: Parts) -> Task:
         """Fits frame 0, which all groups share."""
         argv = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
-        return Task(HEADER, (*argv, *self.header, *self.device), str(parts.header), parts.log(HEADER))
+        command = (*argv, "--sound", "none", *self.header, *self.device)  # groups carry no sound
+        return Task(HEADER, command, str(parts.header), parts.log(HEADER))
 
     def track_task(self, parts: Parts) -> Task:
         """The tracking pass."""
