@@ -65,15 +65,24 @@ def test_render_refuses_what_does_not_go_together(
     assert words in error_of(["render", str(stream), *extra, "--device", QUICKEST], capsys, status=2)
 
 
-@pytest.mark.parametrize(("count", "frames"), [(6, [0, 1, 1, 2, 1, 1]), (2, [0, 1])])
-def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> None:
-    class Reader:
-        packets = (0, 1, 2)
-
-        def scenes(self, start: int) -> list[tuple[int, int]]:
-            return [(i, i) for i in self.packets[start:]]
-
-    assert list(render._ping_pong(Reader(), None, count=count)) == frames  # pyright: ignore
+@pytest.mark.parametrize(
+    ("times", "count", "frames"),
+    [
+        ((0, 1, 2), 6, [(0, 0), (1, 1), (2, 1), (3, 2), (4, 1), (5, 1)]),
+        ((0, 1, 2), 2, [(0, 0), (1, 1)]),
+        ((0, 1, 5), 6, [(0, 0), (1, 1), (5, 2)]),
+    ],
+)
+def test_time_on_a_path_runs_with_the_camera_or_forth_and_back(
+    times: tuple[int, ...], count: int, frames: list[tuple[int, int]]
+) -> None:
+    """Views and frames of a path as long as the stream, which may lack frames, and of a longer one."""
+    packets = [SimpleNamespace(pts_seconds=time / 30) for time in times]
+    reader: Any = SimpleNamespace(
+        packets=packets, header=SimpleNamespace(fps=30.0), scenes=lambda _: zip(packets, range(3), strict=True)
+    )
+    views: Any = range(count)
+    assert list(render._along(reader, views, None)) == frames
 
 
 @pytest.mark.parametrize(
