@@ -123,6 +123,8 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     """Does what was asked."""
     options, seconds = parsed(), float(os.environ.get("STAND_IN_SECONDS", "0.01"))
+    if gpu := os.environ.get("CUDA_VISIBLE_DEVICES"):
+        print("GPU", gpu)
     if options.command == "join":
         join(options)
     elif options.command == "track":

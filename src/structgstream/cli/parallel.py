@@ -179,15 +179,18 @@ def gpus_of(device: Device) -> int:
 
 
 def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
-    """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
+    """The back-end, which on a cluster's driver without a GPU is what that machine has, and as many processes as the
+    workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
     from structgstream.executors.tasks import allocate_slots
 
-    if options.executor == "ray" or gpus_of(device):
-        return ()
+    gpus = gpus_of(device)
+    backend = ("--device", "auto" if options.executor == "ray" and device == "cuda" and not gpus else device)
+    if options.executor == "ray" or gpus:
+        return backend
     cores = usable_cores()
     slots = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
-    return ("--workers", str(min(cores, sum(slot.threads for slot in slots))))
+    return (*backend, "--workers", str(min(cores, sum(slot.threads for slot in slots))))
 
 
 def _job(options: Parallel, rest: list[str]) -> "Job":
