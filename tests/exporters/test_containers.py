@@ -89,6 +89,14 @@ def write_all(path: Path, format: Format, parts: list[BakedGaussians]) -> Path:
     return path
 
 
+@pytest.mark.parametrize("format", ["usd", "4dgs"])
+def test_a_name_without_a_known_ending_is_a_folder(format: Format, tmp_path: Path) -> None:
+    with open_output(tmp_path / "new", format, fps=25.0, options=FrameOptions()) as write:
+        path = write(0, 0.0, some(40, degree=0))
+    assert path == tmp_path / "new" / f"frames.{format}"
+    assert path.is_file()
+
+
 @pytest.mark.parametrize("degree", [0, 1])
 def test_4dgs_has_every_frame_at_its_time(degree: int, tmp_path: Path) -> None:
     parts = frames(degree)

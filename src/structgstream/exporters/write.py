@@ -28,7 +28,7 @@ from structgstream.cameras import Camera
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError, StreamError, import_extra
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
-from structgstream.exporters.formats import FORMATS, Format, FrameOptions, is_one_file
+from structgstream.exporters.formats import FORMATS, SUFFIXES, Format, FrameOptions, is_one_file
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.web import glb_bytes, sog_bytes, splat_bytes, spz_bytes
 from structgstream.kernels.backend import Backend
@@ -202,7 +202,7 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
     folder = output.is_dir()
     if FORMATS[format].all_frames:
         collected = FRAMES_FILES[format](fps=fps)
-        if folder:
+        if folder or SUFFIXES.get(output.suffix.lower().lstrip(".")) != format:
             output = output / f"frames.{format}"
 
         def collect(number: int, seconds: float, gaussians: BakedGaussians) -> Path:
