@@ -78,6 +78,7 @@ def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.Capture
         (["--address", "head:1"], 2, "--address is the head of a Ray cluster; add --executor ray."),
         (["--workers", "0"], 2, "The number of workers must be 1 or more, got 0."),
         (["--preset", "tny"], 2, "there is no preset 'tny'"),
+        (["--preset", "rig"], 1, "scene flow off; groups need the codec compact and scene flow"),
         (["--online.iteration", "5"], 2, "--online.iterations"),
         (
             ["--groups", "7", "--frames", "8", *QUARTER],
