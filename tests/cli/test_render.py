@@ -13,10 +13,12 @@ import pytest
 from structgstream.cli import main, render
 from structgstream.cli.options import parse_options
 from structgstream.codec.reader import open_stream
+from structgstream.codec.sinks import FileSink
 from structgstream.evaluation.camera_path import central_camera
 from tests.support.backends import QUICKEST
 from tests.support.drawn import pixels_of
 from tests.support.quick_streams import CLIP, error_of
+from tests.support.streams import header_for, small_scene, write_stream
 
 
 def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:
@@ -100,6 +102,13 @@ def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> 
     options = parse_options(render.Render, "render", arguments=["videos/ball.sgs", *arguments])
     with open_stream(stream) as reader:
         assert render.default_output(options, reader) == Path("videos") / name
+
+
+def test_a_stream_without_frames_is_not_rendered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty.sgs"
+    write_stream(FileSink(empty), [], header=header_for(small_scene()))
+    for more in ([], ["--path", "orbit"]):
+        assert "no whole frame" in error_of(["render", str(empty), *more], capsys, status=2)
 
 
 def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def recording(sizes: list[dict[str, int]], header: StreamHeader = HEADER) -> Rec
 
 def test_cameras_to_score_are_the_named_or_the_held_out() -> None:
     assert scored_cameras(HEADER, None) == ("cam00",)
-    assert scored_cameras(HEADER, ("cam02", "cam01")) == ("cam02", "cam01")
+    assert scored_cameras(HEADER, ("cam02", "cam01", "cam02")) == ("cam02", "cam01")
     with pytest.raises(ConfigError, match="no camera 'cam9'; it has cam00, cam01, cam02"):
         scored_cameras(HEADER, ("cam00", "cam9"))
     with pytest.raises(ConfigError, match="no held-out camera to score"):

@@ -37,6 +37,8 @@ CHANGES = ("grown", "removed", "spawned", "pruned")
 MAX_PERIODS = 3
 """Tables of the fields of headers are printed for so many periods; ``--json`` has all."""
 PICTURES = (".png", ".svg", ".pdf")
+STREAM_FILES = ("manifest.json", "qualities.json")
+"""Names by which the folder of a stream is told from that of a capture."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.json, ".json", command="inspect", option="--json")
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
-    if options.stream.is_dir() and not (options.stream / "manifest.json").exists():
+    if options.stream.is_dir() and not any((options.stream / name).exists() for name in STREAM_FILES):
         _print_capture(options)
         return
     from structgstream.codec.reader import open_stream

@@ -126,7 +126,7 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
         return header.rig.testing
     if unknown := [name for name in cameras if name not in header.rig.cameras]:
         raise ConfigError(f"The stream has no camera {unknown[0]!r}; it has {', '.join(header.rig)}.")
-    return cameras
+    return tuple(dict.fromkeys(cameras))
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
