@@ -271,8 +271,6 @@ class _Comparison:
                 truth=truth,
                 picture=picture,
                 before=last if number == index - 1 else None,
-                camera=camera,
-                index=index,
                 mask=mask,
             )
             self.before[camera] = index, now
