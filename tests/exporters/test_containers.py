@@ -62,7 +62,7 @@ def check(found: BakedGaussians, wanted: BakedGaussians, *, within: float = 1e-5
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_glb_as_fourdgs_reads_it(degree: int, tmp_path: Path) -> None:
     wanted = some(degree=degree)
-    (tmp_path / "set.glb").write_bytes(glb_bytes(wanted))
+    (tmp_path / "set.glb").write_bytes(glb_bytes(wanted, FrameOptions()))
     imported = fourdgs.from_gltf(str(tmp_path / "set.glb"))
     assert imported.gaussians.count == len(wanted)
     assert imported.metadata["color_space"] == "srgb-rec709-display"
