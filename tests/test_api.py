@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -169,6 +169,12 @@ def test_what_is_returned_is_exported() -> None:
             returned |= classes_in(hint)
     assert {kind.__name__ for kind in returned} >= {"FrameReport", "FrameScores", "Report", "Scores", "StreamReader"}
     assert not {kind.__name__ for kind in returned} - {*structgstream.__all__}
+
+
+@pytest.mark.parametrize(("sink", "seconds"), [("file", 5.0), ("segments", -5.0)])
+def test_a_window_that_cannot_be_is_refused(tmp_path: Path, sink: Literal["file", "segments"], seconds: float) -> None:
+    with pytest.raises(ConfigError, match=f"window_seconds is a positive number .* got {seconds:g} for sink='{sink}'"):
+        structgstream.reconstruct(tmp_path, tmp_path / "out", sink=sink, window_seconds=seconds)
 
 
 def test_a_capture_that_cannot_be_opened_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.errors import CaptureError
 from structgstream.exporters.bake import BakedGaussians
+from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.scene.harmonics import Y0
@@ -127,7 +128,7 @@ def test_files_that_make_no_stream(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="of different degrees"):
         imported(tmp_path, [some(5), some(5, degree=1)])
     files = write(tmp_path, [some(5), some(5)])
-    files[1].write_bytes(ply_bytes(some(5).select(torch.zeros(0, dtype=torch.int64))))
+    files[1].write_bytes(ply_bytes(some(5).select(torch.zeros(0, dtype=torch.int64)), FrameOptions()))
     with pytest.raises(CaptureError, match=r"frame_1\.ply has no Gaussian"):
         import_sequence(files, tmp_path / "out.sgs", fps=2.0, backend=quickest_backend(), rig=RIG)
     assert not (tmp_path / "out.sgs").exists()

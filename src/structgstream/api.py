@@ -5,6 +5,7 @@ Each does what the command of the same name does by default, without output to t
 the units of the capture.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -158,6 +159,11 @@ def reconstruct(
     """
     if resume and overwrite:
         raise ConfigError("resume continues the file and overwrite replaces it: choose one.")
+    if window_seconds is not None and not (sink == "segments" and 0.0 < window_seconds < math.inf):
+        raise ConfigError(
+            f"window_seconds is a positive number of seconds, for sink='segments'; got {window_seconds:g} for "
+            f"sink={sink!r}."
+        )
     named = preset if isinstance(preset, str) else None
     config = with_budget(
         preset_named(preset) if isinstance(preset, str) else preset, name=named, quality=quality, mbits=mbits

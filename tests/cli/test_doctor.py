@@ -17,7 +17,7 @@ def test_everything_is_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert [entry["name"] for entry in found["backends"]] == ["cuda", "cpu", "reference"]
     assert sum(entry["state"].startswith("chosen") for entry in found["backends"]) == 1
     names = {"av", "cv2", "scipy", "yaml", "matplotlib", "starlette", "uvicorn", "s3fs", "anywidget"}
-    names |= {"prometheus_client", "pxr", "fourdgs"}
+    names |= {"prometheus_client", "pxr", "fourdgs", "PIL", "pycolmap", "ray"}
     assert {entry["name"] for entry in found["packages"]} == names
     text = capsys.readouterr().out
     assert "reference" in text

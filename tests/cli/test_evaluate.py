@@ -3,11 +3,18 @@
 
 import json
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
-from structgstream.cli import main
+from structgstream.cli import evaluate, main
+from structgstream.codec.reader import open_stream
+from structgstream.data.source import SourceWrapper
+from structgstream.evaluation.recording import capture_of
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import select_backend
 from tests.support.backends import QUICKEST
 from tests.support.quick_streams import CLIP, error_of
 
@@ -46,20 +53,39 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert max(len(line) for line in table.splitlines() if str(folder) not in line) <= 80
 
 
+def test_a_camera_that_is_absent_from_the_sampled_frames_is_in_the_contact_sheet(
+    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass(frozen=True)
+    class Late(SourceWrapper):
+        def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+            for frame in self.source.frames(start):
+                yield frame if frame.index else replace(frame, images={})
+
+    monkeypatch.setattr(evaluate, "SHEET_COLUMNS", 1)
+    backend, folder = select_backend(QUICKEST), tmp_path / "report"
+    with open_stream(stream) as reader:
+        late = Late(capture_of(reader.header, CLIP, frames=3))
+        evaluate.run_evaluation(
+            reader, late, stream=stream, backend=backend, cameras=None, folder=folder, metrics="basic"
+        )
+    assert (folder / "contact_sheet.png").is_file()
+
+
 def test_evaluate_says_what_it_could_not_measure(
     stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("STRUCTGSTREAM_LPIPS_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    evaluate = ["evaluate", str(stream), CLIP, "--device", QUICKEST]
-    assert main(evaluate) == 0
+    arguments = ["evaluate", str(stream), CLIP, "--device", QUICKEST]
+    assert main(arguments) == 0
     table = " ".join(capsys.readouterr().out.split())
     assert "lpips_alex, t_lpips: the weights of AlexNet were not found" in table
     assert "ms_ssim: pictures need 161 pixels a side" in table
     assert "tFLIP" in table
-    assert main([*evaluate, "--metrics", "basic"]) == 0
+    assert main([*arguments, "--metrics", "basic"]) == 0
     table = capsys.readouterr().out
     assert "tFLIP" not in table
     assert "not available" not in table
-    nowhere = [*evaluate, "--lpips-weights", str(tmp_path / "none")]
+    nowhere = [*arguments, "--lpips-weights", str(tmp_path / "none")]
     assert "none, where the path given has the weights" in error_of(nowhere, capsys, status=1)

@@ -71,7 +71,9 @@ def test_no_command_writes_a_file_of_another_kind(capsys: pytest.CaptureFixture[
         ["track", "x", "--init", "h.sgs", "-o", "h.sgs"],
     ):
         assert main(arguments) == 2
-        assert "writes no ." in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "writes no ." in said
+        assert not said.rstrip().endswith("writes .")
 
 
 def test_a_path_is_what_a_shell_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,6 +81,10 @@ def test_a_path_is_what_a_shell_makes_of_it(tmp_path: Path, monkeypatch: pytest.
     options = parse_options(Join, "join", arguments=["~/a.sgs", "b.sgs", "-o", "~/c.sgs"])
     assert options.segments == (tmp_path / "a.sgs", Path("b.sgs"))
     assert options.output == tmp_path / "c.sgs"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    options = parse_options(Join, "join", arguments=[".", "folder/..", "-o", "c.sgs"])
+    assert options.segments == (tmp_path.resolve(), tmp_path.resolve())
     with pytest.raises(UsageError, match="output '-' would be a file"):
         parse_options(Join, "join", arguments=["a.sgs", "-o", "-"])
     with pytest.raises(UsageError, match="no user"):

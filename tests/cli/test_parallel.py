@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli import main, parallel
-from structgstream.cli.options import CaptureOptions
+from structgstream.cli.options import CaptureOptions, Device
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
@@ -78,6 +78,7 @@ def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.Capture
         (["--address", "head:1"], 2, "--address is the head of a Ray cluster; add --executor ray."),
         (["--workers", "0"], 2, "The number of workers must be 1 or more, got 0."),
         (["--preset", "tny"], 2, "there is no preset 'tny'"),
+        (["--preset", "rig"], 1, "scene flow off; groups need the codec compact and scene flow"),
         (["--online.iteration", "5"], 2, "--online.iterations"),
         (
             ["--groups", "7", "--frames", "8", *QUARTER],
@@ -159,17 +160,21 @@ def test_a_wrong_capture_leaves_nothing_behind(tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "device", "gpus", "words"),
     [
-        (WorkerOptions(workers=1, threads=1), ("--workers", "1")),
-        (WorkerOptions("ray"), ()),
+        (WorkerOptions(workers=1, threads=1), "cpu", 0, ("--device", "cpu", "--workers", "1")),
+        (WorkerOptions("ray"), "cpu", 0, ("--device", "cpu")),
+        (WorkerOptions("ray"), "cuda", 0, ("--device", "auto")),
+        (WorkerOptions("ray"), "cuda", 1, ("--device", "cuda")),
+        (WorkerOptions(), "cuda", 1, ("--device", "cuda")),
     ],
 )
-def test_joining_takes_no_more_processes_than_the_run_has_threads(
-    options: WorkerOptions, words: tuple[str, ...]
+def test_joining_takes_what_this_machine_has_and_no_more_processes_than_the_run_has_threads(
+    options: WorkerOptions, device: Device, gpus: int, words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert join_arguments(options, "cpu") == words
+    monkeypatch.setattr(parallel, "gpus_of", lambda device: gpus)
+    assert join_arguments(options, device) == words
 
 
 def test_joining_takes_all_cores_that_the_workers_have() -> None:
-    assert join_arguments(WorkerOptions(), "cpu") == ("--workers", str(usable_cores()))
+    assert join_arguments(WorkerOptions(), "cpu") == ("--device", "cpu", "--workers", str(usable_cores()))

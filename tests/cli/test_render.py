@@ -13,10 +13,12 @@ import pytest
 from structgstream.cli import main, render
 from structgstream.cli.options import parse_options
 from structgstream.codec.reader import open_stream
+from structgstream.codec.sinks import FileSink
 from structgstream.evaluation.camera_path import central_camera
 from tests.support.backends import QUICKEST
 from tests.support.drawn import pixels_of
 from tests.support.quick_streams import CLIP, error_of
+from tests.support.streams import header_for, small_scene, write_stream
 
 
 def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:
@@ -65,15 +67,24 @@ def test_render_refuses_what_does_not_go_together(
     assert words in error_of(["render", str(stream), *extra, "--device", QUICKEST], capsys, status=2)
 
 
-@pytest.mark.parametrize(("count", "frames"), [(6, [0, 1, 1, 2, 1, 1]), (2, [0, 1])])
-def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> None:
-    class Reader:
-        packets = (0, 1, 2)
-
-        def scenes(self, start: int) -> list[tuple[int, int]]:
-            return [(i, i) for i in self.packets[start:]]
-
-    assert list(render._ping_pong(Reader(), None, count=count)) == frames  # pyright: ignore
+@pytest.mark.parametrize(
+    ("times", "count", "frames"),
+    [
+        ((0, 1, 2), 6, [(0, 0), (1, 1), (2, 1), (3, 2), (4, 1), (5, 1)]),
+        ((0, 1, 2), 2, [(0, 0), (1, 1)]),
+        ((0, 1, 5), 6, [(0, 0), (1, 1), (5, 2)]),
+    ],
+)
+def test_time_on_a_path_runs_with_the_camera_or_forth_and_back(
+    times: tuple[int, ...], count: int, frames: list[tuple[int, int]]
+) -> None:
+    """Views and frames of a path as long as the stream, which may lack frames, and of a longer one."""
+    packets = [SimpleNamespace(pts_seconds=time / 30) for time in times]
+    reader: Any = SimpleNamespace(
+        packets=packets, header=SimpleNamespace(fps=30.0), scenes=lambda _: zip(packets, range(3), strict=True)
+    )
+    views: Any = range(count)
+    assert list(render._along(reader, views, None)) == frames
 
 
 @pytest.mark.parametrize(
@@ -91,6 +102,13 @@ def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> 
     options = parse_options(render.Render, "render", arguments=["videos/ball.sgs", *arguments])
     with open_stream(stream) as reader:
         assert render.default_output(options, reader) == Path("videos") / name
+
+
+def test_a_stream_without_frames_is_not_rendered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty.sgs"
+    write_stream(FileSink(empty), [], header=header_for(small_scene()))
+    for more in ([], ["--path", "orbit"]):
+        assert "no whole frame" in error_of(["render", str(empty), *more], capsys, status=2)
 
 
 def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 """Tables of numbers that are given here. How they look for real streams is in ``test_inspect.py``."""
 
 import io
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -75,8 +76,11 @@ def test_a_stream_that_is_not_whole_says_why(damage: list[dict[str, int]], state
 
 
 def test_the_rate_by_hand() -> None:
-    """50 kB a frame, 30 times a second, 8 bits each."""
-    assert bit_rate_text(rows(3, bytes=50_000), 30.0) == "12.00 Mbit/s without the header"
+    """50 kB a frame, 25 times a second, 8 bits each; with a frame in 2 s instead, three in 4.04 s."""
+    assert bit_rate_text(rows(3, bytes=50_000), 25.0) == "10.00 Mbit/s without the header"
+    sparse = [replace(row, pts_seconds=2.0 * row.index) for row in rows(3, bytes=50_000)]
+    assert bit_rate_text(sparse, 25.0) == "0.30 Mbit/s without the header"
+    assert "frames 3, at most 25 a second, 4.04 s" in shown(facts_table(HEADER, sparse, packets=[]))
 
 
 def test_the_header_by_field_the_largest_first() -> None:

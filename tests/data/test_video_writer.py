@@ -42,6 +42,15 @@ def test_a_player_sees_every_frame_in_its_colours(tmp_path: Path) -> None:
     assert [entry.name for entry in path.parent.iterdir()] == ["path.mp4"]
 
 
+@pytest.mark.parametrize("channels", [None, 1])
+def test_pictures_come_at_their_times_with_and_without_sound(channels: int | None, tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "v.mp4", fps=30, channels=channels) as video:
+        for number, seconds in enumerate((0.0, 2.0, 2.5)):
+            video.write(gradient(number), seconds=seconds)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        assert [frame.time for frame in container.decode(video=0)] == [0.0, 2.0, 2.5]
+
+
 def test_an_odd_size_is_padded(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "odd.mp4", fps=29.97) as video:
         video.write(gradient(0, height=33, width=41))

@@ -72,7 +72,7 @@ def recording(sizes: list[dict[str, int]], header: StreamHeader = HEADER) -> Rec
 
 def test_cameras_to_score_are_the_named_or_the_held_out() -> None:
     assert scored_cameras(HEADER, None) == ("cam00",)
-    assert scored_cameras(HEADER, ("cam02", "cam01")) == ("cam02", "cam01")
+    assert scored_cameras(HEADER, ("cam02", "cam01", "cam02")) == ("cam02", "cam01")
     with pytest.raises(ConfigError, match="no camera 'cam9'; it has cam00, cam01, cam02"):
         scored_cameras(HEADER, ("cam00", "cam9"))
     with pytest.raises(ConfigError, match="no held-out camera to score"):
@@ -117,6 +117,10 @@ def test_a_capture_that_is_too_short_or_begins_elsewhere_is_reported() -> None:
         check_same_frames(recording([*four, {}]), source)
     late = recording(four, replace(HEADER, metadata={"start": 7}))
     check_same_frames(late, source)
+    gapped = recording(four)
+    cast("list[PacketInfo]", gapped.packets)[2] = replace(gapped.packets[2], pts_seconds=0.1)
+    with pytest.raises(CaptureError, match=r"Frame 2 of the stream is of 0\.100 s, and that of .* hall of 0\.067 s"):
+        check_same_frames(gapped, source)
     assert numbers_of(source) is numbers_of(section(source, start=2, frames=2)) is None
 
 
@@ -132,6 +136,9 @@ def test_sizes_and_rates_by_hand() -> None:
     assert facts["megabits_per_second_with_header"] == pytest.approx(820 * 8 / 1e6 / 0.1)
     assert facts["cameras"] == {"cam00": "held out", "cam02": "training"}
     assert facts["metadata"] == {"capture": "test"}
+    sparse = recording([{}, {}])  # two frames 2 s apart
+    cast("list[PacketInfo]", sparse.packets)[1] = replace(sparse.packets[1], pts_seconds=2 - 1 / 30)
+    assert stream_facts(sparse, ())["megabits_per_second"] == pytest.approx(20 * 8e-6 / 2)
 
 
 def log(index: int, seconds: float, peak: int | None, **stages: int) -> dict[str, Any]:

@@ -4,7 +4,8 @@
 import cv2
 import numpy as np
 
-from structgstream.evaluation.optional_metrics import dis_flow
+from structgstream.evaluation.optional_metrics import flow_field
+from structgstream.flow import dis_search
 
 
 def textured(height: int = 96, width: int = 128) -> np.ndarray:
@@ -15,7 +16,7 @@ def textured(height: int = 96, width: int = 128) -> np.ndarray:
 def test_a_shift_is_found() -> None:
     before = textured()
     now = np.roll(before, (2, 5), (0, 1))  # down by 2, right by 5: pixels were 5 left of and 2 above where they are
-    field = dis_flow()(before, now, "cam", 1)
+    field = flow_field(dis_search("eval"), before, now)
     inner = field.offsets[12:-12, 12:-12].reshape(-1, 2)
     np.testing.assert_allclose(np.median(inner, 0), [-5, -2], atol=0.1)
     assert np.mean(np.abs(inner - [-5, -2]).max(1) < 0.5) > 0.97
@@ -29,7 +30,7 @@ def test_what_was_covered_is_not_seen() -> None:
     now = before.copy()
     bar = textured()[::-1, 40:70][:, ::-1]
     before[:, 60:90], now[:, 50:80] = bar, bar
-    field = dis_flow()(before, now, "cam", 1)
+    field = flow_field(dis_search("eval"), before, now)
     assert field.seen[10:-10, 56:74].mean() > 0.9
     assert field.seen[10:-10, 82:88].mean() < 0.5
     assert field.seen[10:-10, 10:40].mean() > 0.95

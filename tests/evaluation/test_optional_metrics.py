@@ -13,6 +13,7 @@ from structgstream.errors import ConfigError
 from structgstream.evaluation.flip import features_of, flip_of
 from structgstream.evaluation.lpips import ALEX, ENVIRONMENT, VGG, Lpips, published_heads
 from structgstream.evaluation.optional_metrics import TEMPORAL, OptionalMetrics, load_optional_metrics, optional_scores
+from structgstream.flow import dis_search
 from tests.support.rigs import arc_rig
 
 CPU = torch.device("cpu")
@@ -52,9 +53,7 @@ def test_missing_weights_are_reported_and_nothing_takes_their_place() -> None:
     assert ALEX.file in optional_metrics.not_available["t_lpips"]
     assert VGG.file in optional_metrics.not_available["lpips_vgg"]
     assert optional_metrics.lpips == {}
-    scores, _ = optional_scores(
-        optional_metrics, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0
-    )
+    scores, _ = optional_scores(optional_metrics, truth=noise(0), picture=noise(1), before=None)
     assert scores["lpips_alex"] is scores["lpips_vgg"] is None
     assert scores["flip"] == flip(noise(1), noise(0))
 
@@ -64,12 +63,8 @@ def test_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     optional_metrics = load_optional_metrics(cameras(640, 360), frames=5, device=CPU)
     for name in ("flip", "temporal_flip", "e_warp"):
         assert "structgstream[eval]" in optional_metrics.not_available[name]
-    _, before = optional_scores(
-        optional_metrics, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0
-    )
-    scores, _ = optional_scores(
-        optional_metrics, truth=noise(0), picture=noise(1), before=before, camera="cam00", index=1
-    )
+    _, before = optional_scores(optional_metrics, truth=noise(0), picture=noise(1), before=None)
+    scores, _ = optional_scores(optional_metrics, truth=noise(0), picture=noise(1), before=before)
     assert scores.get("flip") is scores.get("e_warp") is scores.get("temporal_flip") is None
     assert scores["flicker"] == 0.0
 
@@ -90,14 +85,10 @@ def test_wrong_weights_are_an_error_not_a_gap(tmp_path: Path) -> None:
 
 def test_scores_over_time_are_differences_of_distances() -> None:
     alex = seeded_alex()
-    optional_metrics = OptionalMetrics(features_of, {"alex": alex}, None)
+    optional_metrics = OptionalMetrics(dis_search("eval"), {"alex": alex})
     truths, pictures = (noise(0), noise(1)), (noise(2), noise(2) // 2)
-    _, before = optional_scores(
-        optional_metrics, truth=truths[0], picture=pictures[0], before=None, camera="cam00", index=0
-    )
-    scores, _ = optional_scores(
-        optional_metrics, truth=truths[1], picture=pictures[1], before=before, camera="cam00", index=1
-    )
+    _, before = optional_scores(optional_metrics, truth=truths[0], picture=pictures[0], before=None)
+    scores, _ = optional_scores(optional_metrics, truth=truths[1], picture=pictures[1], before=before)
 
     def lpips(a: np.ndarray, b: np.ndarray) -> float:
         return alex.distance(alex.features(a), alex.features(b))

@@ -6,7 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from structgstream.evaluation.pictures import contact_sheet, difference, side_by_side, spread_indices, thumbnail
+from structgstream.evaluation.pictures import (
+    LARGEST_TILE,
+    contact_sheet,
+    difference,
+    side_by_side,
+    spread_indices,
+    thumbnail,
+)
 from tests.support.drawn import pixels_of
 
 
@@ -23,12 +30,12 @@ def test_side_by_side_is_truth_rendering_difference() -> None:
 
 
 def test_thumbnails_are_block_means() -> None:
-    picture = np.zeros((6, 8, 3), np.uint8)
+    picture = np.zeros((6, 2 * LARGEST_TILE, 3), np.uint8)
     picture[:2, :2] = [[[0], [100]], [[100], [200]]]
-    small = thumbnail(picture, 4)
-    assert small.shape == (3, 4, 3)
+    small = thumbnail(picture)
+    assert small.shape == (3, LARGEST_TILE, 3)
     assert small[0, 0, 0] == 100
-    np.testing.assert_array_equal(thumbnail(picture, 8), picture)
+    np.testing.assert_array_equal(thumbnail(small), small)
 
 
 def test_sampled_frames_hold_the_first_and_the_last() -> None:

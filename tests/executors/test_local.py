@@ -5,14 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.executors.tasks import LocalEngine, Task, TaskQueue, WorkerSlot
-from tests.support.sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
+from tests.support.sleepers import all_endings, begun, is_gone, module, wait_for, writes
 
 
 def local(count: int = 2, gpu: int | None = None) -> TaskQueue:
@@ -105,24 +104,3 @@ with local() as executor:
     driver.wait()
     assert is_gone(int((tmp_path / "child").read_text()))
     assert begun(tmp_path) == ["long"]
-
-
-def wait_for(path: Path) -> None:
-    end = time.monotonic() + PATIENCE_SECONDS
-    while not (path.exists() and path.read_text().endswith("\n")):
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def is_gone(pid: int) -> bool:
-    """Whether a process ends, or is only waited for by its parent."""
-    end = time.monotonic() + PATIENCE_SECONDS
-    while time.monotonic() < end:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except (FileNotFoundError, ProcessLookupError):
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.02)
-    return False

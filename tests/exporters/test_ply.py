@@ -54,7 +54,7 @@ def test_ply_as_plyfile_reads_it(degree: int, tmp_path: Path) -> None:
 
 def test_ply_of_a_solid_gaussian_is_finite() -> None:
     solid = replace(some(2), opacities=torch.tensor([1.0, 0.0]))
-    data = ply_bytes(solid)
+    data = ply_bytes(solid, FrameOptions())
     assert np.isfinite(np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4")).all()
 
 

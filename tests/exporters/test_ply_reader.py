@@ -10,6 +10,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from structgstream.errors import CaptureError
+from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.ply import find_sequence, ply_bytes, read_ply
 from tests.support.plain import some
 
@@ -18,7 +19,7 @@ from tests.support.plain import some
 def test_another_library_s_file(degree: int, tmp_path: Path) -> None:
     """Properties in another order and of other types, one more of them, and a second element."""
     wanted = some(20, degree=degree)
-    (tmp_path / "ours.ply").write_bytes(ply_bytes(wanted))
+    (tmp_path / "ours.ply").write_bytes(ply_bytes(wanted, FrameOptions()))
     ours = PlyData.read(str(tmp_path / "ours.ply"))["vertex"].data
     names = [name for name in reversed(ours.dtype.names) if not name.startswith("n")]
     rows = np.empty(20, [("label", "u1"), *((name, "f8" if name == "x" else "f4") for name in names)])
@@ -54,7 +55,7 @@ def test_sequences_that_are_none(names: tuple[str, ...], words: str, tmp_path: P
         find_sequence(tmp_path)
 
 
-GOOD = ply_bytes(some(5, degree=1))
+GOOD = ply_bytes(some(5, degree=1), FrameOptions())
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,10 @@ GOOD = ply_bytes(some(5, degree=1))
         (GOOD.replace(b"f_rest_8\n", b"f_more_8\n"), "has 8 properties f_rest|lacks the property f_rest"),
         (GOOD.replace(b"float x\n", b"quad x\n"), "of unknown types"),
         (GOOD[:-100], "ends after 4 of 5 Gaussians"),
-        (ply_bytes(replace(some(5), means=torch.full((5, 3), torch.inf))), "5 of 5 Gaussians of .* finite"),
+        (
+            ply_bytes(replace(some(5), means=torch.full((5, 3), torch.inf)), FrameOptions()),
+            "5 of 5 Gaussians of .* finite",
+        ),
     ],
 )
 def test_files_that_cannot_be_read(data: bytes, words: str, tmp_path: Path) -> None:

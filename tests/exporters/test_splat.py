@@ -11,6 +11,7 @@ from torch import Tensor
 
 from structgstream.errors import ConfigError
 from structgstream.exporters.bake import BakedGaussians
+from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.web import splat_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
@@ -69,4 +70,4 @@ def angle(one: Tensor, other: Tensor) -> float:
 
 def test_splat_holds_one_colour() -> None:
     with pytest.raises(ConfigError, match="degree 1"):
-        splat_bytes(some(degree=1))
+        splat_bytes(some(degree=1), FrameOptions())

@@ -67,7 +67,7 @@ def test_spz_as_gsply_reads_it(
 
 def test_spz_header() -> None:
     """As the public description has it; positions use the bits that they have."""
-    data = gzip.decompress(spz_bytes(some(10, degree=1)))
+    data = gzip.decompress(spz_bytes(some(10, degree=1), FrameOptions()))
     magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
     assert (magic, version, count, degree, flags, reserved) == (b"NGSP", 2, 10, 1, 0, 0)
     assert len(data) == 16 + 10 * (9 + 1 + 3 + 3 + 3 + 9)
@@ -80,4 +80,4 @@ def test_spz_header() -> None:
 @pytest.mark.parametrize("value", [1e7, math.inf, math.nan])
 def test_spz_refuses_what_does_not_fit(value: float) -> None:
     with pytest.raises(ConfigError, match=r"export a \.ply"):
-        spz_bytes(replace(some(1), means=torch.tensor([[0.0, value, 0.0]])))
+        spz_bytes(replace(some(1), means=torch.tensor([[0.0, value, 0.0]])), FrameOptions())

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What groups share is the beginning of any stream with scene flow."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from structgstream.codec.reader import open_stream
+from structgstream.codec.sound import SoundFormat
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.join import join_segments
@@ -31,3 +33,7 @@ def test_streams_that_cannot_begin_groups_are_refused(tmp_path: Path) -> None:
     path.write_bytes(small_stream(1))
     with pytest.raises(ConfigError, match="codec raw and scene flow off"):
         _ = GroupBase.read(path).config
+    base = GroupBase.read(made().header)
+    heard = replace(base, header=replace(base.header, sound=SoundFormat(1)))
+    with pytest.raises(ConfigError, match="has sound, which groups do not carry; make it with --sound none"):
+        _ = heard.config

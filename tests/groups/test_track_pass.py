@@ -36,8 +36,9 @@ def test_interrupted_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
 
 def test_cut_in_a_record_it_goes_on_before_that(tmp_path: Path) -> None:
     path, whole = tmp_path / "track", made().track.read_bytes()
-    for cut in (200, len(whole) - 200):
-        partial_path(path).write_bytes(whole[:cut])
+    finished = [(path, len(whole) - 200), (path, len(whole) - 1)]  # damaged after their end
+    for found, cut in [(partial_path(path), 200), (partial_path(path), len(whole) - 200), *finished]:
+        found.write_bytes(whole[:cut])
         track(path, made().header)
         assert path.read_bytes() == whole
         path.unlink()

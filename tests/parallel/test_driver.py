@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError, StorageError, TaskError
-from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
+from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, TaskResult, WorkerSlot
 from structgstream.parallel.driver import Job, Status, drive
 from structgstream.parallel.parts import Parts, group_name
 from tests.support.inline_engine import InlineEngine
@@ -43,6 +43,13 @@ def test_notes_say_what_each_task_took(undisturbed: Path) -> None:
     assert notes["track"].frames == 12
     assert [notes[group_name(*group)].frames for group in GROUPS] == [4, 4, 4]
     assert all(note.seconds > 0 and note.bytes > 0 and note.attempts == 1 for note in notes.values())
+
+
+def test_segments_are_joined_on_a_gpu_that_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    parts = Parts(tmp_path / "parts")
+    run(replace(job(tmp_path), gpus=1), parts, TaskQueue(LocalEngine([WorkerSlot(1, 1)])))
+    assert [parts.log(name).read_text() for name in ("track", "join")] == ["GPU 7\n", "GPU 5\n"]
 
 
 class ElsewhereEngine(InlineEngine):

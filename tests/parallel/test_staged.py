@@ -17,6 +17,7 @@ from structgstream.parallel import exchange as staged
 from structgstream.parallel.driver import Unit
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore, Staging, Transfer
 from structgstream.parallel.parts import Parts
+from tests.support.sleepers import is_gone, wait_for
 
 
 @pytest.fixture(autouse=True)
@@ -77,6 +78,16 @@ def test_what_a_killed_command_has_left_is_not_taken_and_stays_here(store: Objec
 def test_what_a_failing_command_has_left_is_removed(store: ObjectFolder, tmp_path: Path) -> None:
     assert run(store, 'echo half > "$0/b"; exit 3', "--gives", "b") == 3
     assert not scratch(tmp_path)
+
+
+def test_a_command_ends_with_the_process_that_stages_it(store: ObjectFolder, tmp_path: Path) -> None:
+    script = f"echo $$ > {tmp_path}/pid.new; mv {tmp_path}/pid.new {tmp_path}/pid; exec sleep 60"
+    words = [sys.executable, "-m", staged.__name__, json.dumps(asdict(transfer())), "sh", "-c", script]
+    process = subprocess.Popen(words, env={**os.environ, staged.STORE: store.url})
+    wait_for(tmp_path / "pid")
+    process.kill()
+    process.wait()
+    assert is_gone(int((tmp_path / "pid").read_text()))
 
 
 def test_a_run_that_was_begun_anew_finds_nothing_of_the_one_before(store: ObjectFolder, tmp_path: Path) -> None:

@@ -60,16 +60,18 @@ def test_frame_0_may_be_resumed_and_all_segments_are_joined(tmp_path: Path, part
     given_unit = unit(tmp_path, header=("--preset", "tiny"))
     words = after(given_unit.header_task(parts).command, "reconstruct")
     assert words == [
-        str(tmp_path / "capture"), "-o", str(parts.header), "--frames", "1", "--resume", "--preset", "tiny",
-        "--device", "cpu",
+        str(tmp_path / "capture"), "-o", str(parts.header), "--frames", "1", "--resume", "--sound", "none",
+        "--preset", "tiny", "--device", "cpu",
     ]  # fmt: skip
     task = given_unit.join_task(parts, [(0, 8), (8, 16)], tmp_path / "out.sgs")
     found = parse_options(Join, "join", arguments=after(task.command, "join"))
     assert found.segments == (parts.segment(0, 8), parts.segment(8, 16))
     assert (found.output, found.overwrite) == (tmp_path / "out.sgs", True)
-    assert (found.device, found.plain, found.workers) == ("cpu", False, None)
-    task = replace(given_unit, join=("--workers", "3")).join_task(parts, [(0, 8)], tmp_path / "out.sgs")
-    assert parse_options(Join, "join", arguments=after(task.command, "join")).workers == 3
+    assert (found.device, found.plain, found.workers) == ("auto", False, None)
+    given_unit = replace(given_unit, join=("--device", "reference", "--workers", "3"))
+    task = given_unit.join_task(parts, [(0, 8)], tmp_path / "out.sgs")
+    found = parse_options(Join, "join", arguments=after(task.command, "join"))
+    assert (found.device, found.workers) == ("reference", 3)
 
 
 def test_without_a_number_all_frames_are_tracked_with_as_many_threads_as_asked(tmp_path: Path, parts: Parts) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for executors: quick ones, without this package."""
+"""Commands for executors: quick ones, without this package; whether a process has ended."""
 
+import time
 from pathlib import Path
 
 from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
@@ -31,3 +32,25 @@ def all_endings(executor: TaskQueue) -> dict[str, TaskResult]:
 def begun(folder: Path) -> list[str]:
     """Names of the tasks in the order in which they began, again each time."""
     return (folder / "begun").read_text().split()
+
+
+def wait_for(path: Path) -> None:
+    """Waits until a file has a whole line."""
+    end = time.monotonic() + PATIENCE_SECONDS
+    while not (path.exists() and path.read_text().endswith("\n")):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def is_gone(pid: int) -> bool:
+    """Whether a process ends, or is only waited for by its parent."""
+    end = time.monotonic() + PATIENCE_SECONDS
+    while time.monotonic() < end:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.02)
+    return False

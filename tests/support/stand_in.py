@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands of a parallel run without their work: the same words, files, locks and statuses, and bytes of a hash.
 
-    python -m tests.support.stand_in reconstruct CAPTURE -o HEADER --frames 1 --resume
+    python -m tests.support.stand_in reconstruct CAPTURE -o HEADER --frames 1 --resume --sound none
     python -m tests.support.stand_in track CAPTURE --init HEADER -o TRACK --groups 4 --frames 40
     python -m tests.support.stand_in fit-group CAPTURE --init HEADER --track TRACK --frames 4:8 -o SEGMENT
     python -m tests.support.stand_in join SEGMENT... -o OUT
@@ -111,6 +111,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("-o", dest="output", type=Path, required=True)
     parser.add_argument("--init", type=Path)
     parser.add_argument("--track", type=Path)
+    parser.add_argument("--sound")
     parser.add_argument("--frames", default="40")
     parser.add_argument("--groups", type=int, default=4)
     parser.add_argument("--fail", type=int, help="a segment that begins at this frame fails")
@@ -122,6 +123,8 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     """Does what was asked."""
     options, seconds = parsed(), float(os.environ.get("STAND_IN_SECONDS", "0.01"))
+    if gpu := os.environ.get("CUDA_VISIBLE_DEVICES"):
+        print("GPU", gpu)
     if options.command == "join":
         join(options)
     elif options.command == "track":

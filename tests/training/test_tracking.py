@@ -44,7 +44,6 @@ def test_movers_are_followed_over_many_frames() -> None:
     moved = (found.scene.anchors.positions - scenery.scene.anchors.positions)[:, 0].median()
     assert abs(float(moved) - (FRAMES - 1) * SPEED) < 0.3 * (FRAMES - 1) * SPEED
     assert abs(float(found.velocities[:, 0].median()) - SPEED) < 0.4 * SPEED
-    assert found.moved > 30
 
 
 def test_hidden_anchors_go_along_with_what_hides_them() -> None:
@@ -75,7 +74,7 @@ def test_what_stands_still_keeps_its_bits() -> None:
     scenery = world(speed=0.0)
     found = tracked(scenery)
     assert torch.equal(found.scene.anchors.positions, scenery.scene.anchors.positions)
-    assert (found.moved, float(found.velocities.abs().max())) == (0, 0.0)
+    assert not found.velocities.any()
 
 
 def test_cameras_are_taken_in_turn_and_the_change_is_reported() -> None:

@@ -15,8 +15,10 @@ from structgstream.cli.progress import compact_table, literal_cells, name_value_
 OPTIONAL = (
     ("av", "av", "capture", "read and write video"),
     ("cv2", "opencv-python-headless", "capture", "read pictures, initial points"),
+    ("PIL", "pillow", "capture", "read pictures, export to .sog"),
     ("scipy", "scipy", "capture", "initial points"),
     ("yaml", "pyyaml", "capture", "read calibrations of Kalibr"),
+    ("pycolmap", "pycolmap", "sfm", "command prepare"),
     ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
     ("starlette", "starlette", "serve", "commands play and serve"),
     ("uvicorn", "uvicorn", "serve", "commands play and serve"),
@@ -24,6 +26,7 @@ OPTIONAL = (
     ("pxr", "usd-core", "export", "export to .usd"),
     ("fourdgs", "fourdgs", "export", "export to .4dgs"),
     ("s3fs", "s3fs", "cloud", "publish segments to S3"),
+    ("ray", "ray", "cluster", "parallel runs on several machines"),
     ("anywidget", "anywidget", "notebook", "player in notebooks"),
 )
 

@@ -128,7 +128,8 @@ def run_evaluation(
             status.update(f"evaluating frame {index + 1} of {frames}")
             if folder is not None:
                 worst.see(index, compared)
-                if index in wanted:
+                # The first of each camera, too, which may be absent from all wanted ones.
+                if index in wanted or compared.camera not in compared_pictures:
                     compared_pictures.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
 
         report = evaluate(

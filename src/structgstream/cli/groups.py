@@ -41,7 +41,8 @@ class Track:
     scene: tyro.conf.Positional[Folder]
     """The capture that the header was made from."""
     init: Annotated[StreamFile, tyro.conf.arg(metavar="HEADER.sgs")]
-    """A stream whose header and frame 0 the groups share: reconstruct --frames 1, or any longer stream."""
+    """A stream whose header and frame 0 the groups share: reconstruct --frames 1 --sound none, or any longer stream
+    without sound."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="TRACK")]
     """The track to write."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None

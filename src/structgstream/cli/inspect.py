@@ -37,6 +37,8 @@ CHANGES = ("grown", "removed", "spawned", "pruned")
 MAX_PERIODS = 3
 """Tables of the fields of headers are printed for so many periods; ``--json`` has all."""
 PICTURES = (".png", ".svg", ".pdf")
+STREAM_FILES = ("manifest.json", "qualities.json")
+"""Names by which the folder of a stream is told from that of a capture."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.json, ".json", command="inspect", option="--json")
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
-    if options.stream.is_dir() and not (options.stream / "manifest.json").exists():
+    if options.stream.is_dir() and not any((options.stream / name).exists() for name in STREAM_FILES):
         _print_capture(options)
         return
     from structgstream.codec.reader import open_stream
@@ -177,6 +179,8 @@ def describe_period(
     reader: "StreamReader", place: int, rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """A period as plain values: its frames, its header's fields, and why it begins, if the run's ``log`` says so."""
+    from structgstream.evaluation.byte_count import shown_seconds
+
     begun = reader.periods
     period = begun[place]
     end = begun[place + 1].first_frame if place + 1 < len(begun) else len(reader.packets.offsets)
@@ -187,7 +191,7 @@ def describe_period(
         "period": period.number,
         "first_frame": period.first_frame,
         "frames": end - period.first_frame,
-        "seconds": within[-1].pts_seconds - within[0].pts_seconds + 1.0 / header.fps if within else 0.0,
+        "seconds": shown_seconds(within, header.fps),
         "header_bytes": before + period.bytes,
         "packet_bytes": sum(row.bytes for row in within),
         "begins": log.get(period.first_frame, {}).get("begins"),
@@ -205,14 +209,17 @@ SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the res
 
 def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
     """Facts of the stream: source, length, size, rate, added and removed items, whether it is complete."""
-    cameras = header["cameras"]
+    from structgstream.evaluation.byte_count import shown_seconds
+
+    cameras, seconds = header["cameras"], shown_seconds(rows, header["fps"])
+    at = ", at most" if seconds * header["fps"] > len(rows) + 0.5 else " at"  # a live run leaves frames out
     held_out = [name for name, camera in cameras.items() if camera["held_out"]]
     sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
     table = name_value_table()
     for name, value in header["metadata"].items():
         table.add_row(*literal_cells(name, str(value)))
     table.add_row("codec", header["codec"])
-    table.add_row("frames", f"{len(rows)} at {header['fps']:g} a second, {len(rows) / header['fps']:.2f} s")
+    table.add_row("frames", f"{len(rows)}{at} {header['fps']:g} a second, {seconds:.2f} s")
     table.add_row(
         *literal_cells("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}")
     )
@@ -243,8 +250,10 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
 
 def bit_rate_text(rows: "Sequence[Row]", fps: float) -> str:
     """The mean rate of at least one packet, as text."""
-    mean = sum(row.bytes for row in rows) / len(rows)
-    return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
+    from structgstream.evaluation.byte_count import shown_seconds
+
+    megabits = 8e-6 * sum(row.bytes for row in rows)
+    return f"{megabits / shown_seconds(rows, fps):.2f} Mbit/s without the header"
 
 
 def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:

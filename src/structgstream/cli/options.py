@@ -78,7 +78,8 @@ def check_ending(output: Path | None, *endings: str, command: str, option: str =
     ``folder``."""
     if output is not None and (ending := output.suffix.lower()) in KNOWN_ENDINGS.difference(endings):
         written = " or ".join([*endings, *(["a folder of another name"] if folder else [])])
-        raise UsageError(f"{command} writes no {ending}, got {option} {output}; it writes {written}.")
+        advice = f"it writes {written}" if written else "choose a name without this ending"
+        raise UsageError(f"{command} writes no {ending}, got {option} {output}; {advice}.")
 
 
 def check_new(output: Path, *, overwrite: bool) -> None:
@@ -88,7 +89,8 @@ def check_new(output: Path, *, overwrite: bool) -> None:
 
 
 def checked_paths(options: Options) -> Options:
-    """Options, also those in groups, with ``~`` in paths expanded as a shell does it."""
+    """Options, also those in groups, with ``~`` in paths expanded as a shell does it, and ``.`` and ``..`` at their end
+    resolved, because names of files beside a folder are made from its name."""
     return replace(options, **{one.name: _checked(getattr(options, one.name), one.name) for one in fields(options)})  # type: ignore[type-var]
 
 
@@ -102,9 +104,10 @@ def _checked(value: object, name: str) -> object:
     if str(value) == STANDARD_OUTPUT:
         raise UsageError(f"{name} '-' would be a file or folder of that very name; give a path.")
     try:
-        return value.expanduser()
+        path = value.expanduser()
     except RuntimeError:
         raise UsageError(f"there is no user for {value}; give the path in full.") from None
+    return path.resolve() if path.name in ("", "..") else path
 
 
 def write_json_output(path: Path | None, content: Mapping[str, Any]) -> Console:

@@ -145,10 +145,12 @@ def main(arguments: list[str]) -> None:
 
 def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     """Check the options against the capture, and that the output and its parts may be written."""
+    from structgstream.groups.base import check_for_groups
     from structgstream.groups.track_file import check_length
     from structgstream.recorder import check_output
     from structgstream.session.struct_gstream import stream_pipeline
 
+    check_for_groups(config, name="The configuration")
     source = open_selected_capture(options.scene, options.capture)
     if options.groups is not None and not options.allow_unaligned:
         check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
@@ -179,15 +181,18 @@ def gpus_of(device: Device) -> int:
 
 
 def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
-    """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
+    """The back-end, which on a cluster's driver without a GPU is what that machine has, and as many processes as the
+    workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
     from structgstream.executors.tasks import allocate_slots
 
-    if options.executor == "ray" or gpus_of(device):
-        return ()
+    gpus = gpus_of(device)
+    backend = ("--device", "auto" if options.executor == "ray" and device == "cuda" and not gpus else device)
+    if options.executor == "ray" or gpus:
+        return backend
     cores = usable_cores()
     slots = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
-    return ("--workers", str(min(cores, sum(slot.threads for slot in slots))))
+    return (*backend, "--workers", str(min(cores, sum(slot.threads for slot in slots))))
 
 
 def _job(options: Parallel, rest: list[str]) -> "Job":
@@ -323,7 +328,7 @@ class Plan:
 
     Example: structgstream plan basketball -o probe --machines 1 8 64 --finish-hours 2
 
-    Example: structgstream plan basketball --run ball.sgs.parts --machines 8 --frames 108000
+    Example: structgstream plan basketball --run ball.sgs.parts --machines 8 --length 108000
     """
 
     scene: tyro.conf.Positional[Folder]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream render``."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -77,6 +77,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream, by_index=options.frame is not None)
+    if not reader.packets:
+        raise UsageError("the stream has no whole frame, so there is nothing to render.")
     output = options.output or default_output(options, reader)
     if output.suffix.lower() == ".png" and options.frame is None:
         raise UsageError("a PNG holds one picture: choose it with --frame, or write an .mp4 or a folder.")
@@ -98,20 +100,21 @@ def main(arguments: list[str]) -> None:
     if output.suffix.lower() == ".png":
         pictures = islice(pictures, 1)
     has_sound = output.suffix.lower() == ".mp4" and reader.header.sound is not None
-    in_step = options.frame is None and (options.path is None or path_length(reader, options.seconds) <= len(reader))
+    is_whole_path = options.path is None or is_in_step(reader, path_length(reader, options.seconds))
+    in_step = options.frame is None and is_whole_path
     if has_sound and not in_step:
         print_lines(Console(stderr=True), "The video has no sound, because it does not show the stream as it is.")
-    write_pictures(output, pictures, fps=reader.header.fps, heard=reader if has_sound and in_step else None)
+    write_pictures(output, pictures, fps=reader.header.fps, shown=reader if in_step else None)
     print_lines(Console(), f"Wrote {output}")
 
 
 def write_pictures(
-    output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float, heard: "StreamReader | None" = None
+    output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float, shown: "StreamReader | None" = None
 ) -> None:
     """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``.
 
     Args:
-        heard: the stream whose frames the pictures show, one after the other; a video gets its sound and its times.
+        shown: the stream whose frames the pictures show, one after the other; a video gets their times and its sound.
     """
     from structgstream.data.sound import SoundDecoder
     from structgstream.data.video_writer import VideoWriter
@@ -119,16 +122,16 @@ def write_pictures(
 
     with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
-            format = None if heard is None else heard.header.sound
+            format = None if shown is None else shown.header.sound
             decoder = None if format is None else SoundDecoder(format.channels)
             with VideoWriter(output, fps=fps, channels=None if format is None else format.channels) as video:
                 for number, picture in enumerate(pictures):
-                    if heard is None or decoder is None:
+                    if shown is None:
                         video.write(picture)
                     else:
-                        start = heard.packets[0].pts_seconds
-                        video.write(picture, seconds=heard.packets[number].pts_seconds - start)
-                        if (sound := heard.sound(number)) is not None:
+                        start = shown.packets[0].pts_seconds
+                        video.write(picture, seconds=shown.packets[number].pts_seconds - start)
+                        if decoder is not None and (sound := shown.sound(number)) is not None:
                             samples = decoder.decode(sound.packets, sound.seconds)
                             video.write_sound(samples, seconds=sound.seconds - start)
                     status.update(f"rendering picture {number + 1}")
@@ -160,7 +163,8 @@ def path_pictures(
     seconds: float | None = None,
     frame: int | None = None,
 ) -> "Iterator[NDArray[np.uint8]]":
-    """Renderings of a moving camera; a stream shorter than the path is played slowed, forward and backward."""
+    """Renderings of a moving camera: a picture for each frame, where the camera is at its time; a stream shorter than
+    the path is played slowed, forward and backward, with a picture for each view."""
     from structgstream.evaluation.camera_path import arc, orbit
     from structgstream.evaluation.evaluate import rendered
     from structgstream.scene.state import on_device
@@ -169,14 +173,25 @@ def path_pictures(
     count = path_length(reader, seconds)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
-    for view, scene in zip(views, _ping_pong(reader, frame, count=count), strict=True):
+    for view, scene in _along(reader, views, frame):
         yield rendered(on_device(scene, backend.device), header.camera(view), backend)[0]
 
 
 def path_length(reader: "StreamReader", seconds: float | None) -> int:
-    """The pictures of a camera path of this duration; None: the stream's, or a little longer."""
-    length = max(len(reader.packets) / reader.header.fps, MIN_PATH_SECONDS) if seconds is None else seconds
-    return max(round(length * reader.header.fps), 1)
+    """The views of a camera path of this duration, at the stream's rate; None: the stream's, or a little longer."""
+    from structgstream.evaluation.byte_count import shown_seconds
+
+    fps = reader.header.fps
+    length = max(shown_seconds(reader.packets, fps), MIN_PATH_SECONDS) if seconds is None else seconds
+    return max(round(length * fps), 1)
+
+
+def is_in_step(reader: "StreamReader", count: int) -> bool:
+    """Whether the stream lasts as long as a path of ``count`` views, which then shows it at its speed."""
+    from structgstream.evaluation.byte_count import shown_seconds
+
+    fps = reader.header.fps
+    return round(shown_seconds(reader.packets, fps) * fps) >= count
 
 
 def compared_pictures(
@@ -230,14 +245,21 @@ def default_output(options: Render, reader: "StreamReader") -> Path:
     return options.stream.with_name(f"{options.stream.stem}-{name}{ending}{suffix}")
 
 
-def _ping_pong(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
-    if frame is None and len(reader.packets) >= count:
-        yield from islice(scenes_of(reader, None), count)
+def _along(reader: "StreamReader", views: "Sequence[Camera]", frame: int | None) -> "Iterator[tuple[Camera, Scene]]":
+    """The views of a path, which are a frame's distance apart, with the scenes that they show."""
+    count = len(views)
+    if frame is None and is_in_step(reader, count):
+        start = reader.packets[0].pts_seconds
+        for info, scene in reader.scenes(0):
+            place = round((info.pts_seconds - start) * reader.header.fps)
+            if place >= count:
+                return
+            yield views[place], scene
         return
     # A stream shorter than the path fits in memory: its scenes share static fields.
     scenes = list(scenes_of(reader, frame))
-    for number in range(count):
-        yield scenes[round((len(scenes) - 1) * (1.0 - abs(1.0 - 2.0 * number / count)))]
+    for number, view in enumerate(views):
+        yield view, scenes[round((len(scenes) - 1) * (1.0 - abs(1.0 - 2.0 * number / count)))]
 
 
 def _check_frame(reader: "StreamReader", frame: int | None) -> None:

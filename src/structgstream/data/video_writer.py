@@ -17,7 +17,7 @@ from structgstream.errors import StorageError
 from structgstream.opus import SAMPLE_RATE
 
 SOUND_BITS_PER_SECOND = 128_000
-TICKS = 90_000  # a second, of pictures with times
+TICKS = 90_000  # a second
 
 
 class VideoWriter(AbstractContextManager["VideoWriter"]):
@@ -53,25 +53,22 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
         state_bt709(context)
         self._sound, self._heard = None, 0
+        context.time_base = Fraction(1, TICKS)
         if channels is not None:
-            context.time_base = Fraction(1, TICKS)
             self._sound = self._container.add_stream("aac", rate=SAMPLE_RATE)
             self._sound.layout = "mono" if channels == 1 else "stereo"
             self._sound.codec_context.bit_rate = SOUND_BITS_PER_SECOND
 
     def write(self, picture: NDArray[np.uint8], *, seconds: float | None = None) -> None:
-        """Adds a picture ``[H, W, 3]`` sRGB, in a video with sound shown at ``seconds``; None: at the next multiple of
-        the frames' distance."""
+        """Adds a picture ``[H, W, 3]`` sRGB, shown at ``seconds``; None: at the next multiple of the frames'
+        distance."""
         height, width = picture.shape[:2]
         even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._count == 0:
             self._stream.height, self._stream.width = even.shape[:2]
         frame = bt709_frame(even)
-        if self._sound is None:
-            frame.pts, frame.time_base = self._count, 1 / self._fps
-        else:
-            at = self._count / self._fps if seconds is None else seconds
-            frame.pts, frame.time_base = round(at * TICKS), Fraction(1, TICKS)
+        at = self._count / self._fps if seconds is None else seconds
+        frame.pts, frame.time_base = round(at * TICKS), Fraction(1, TICKS)
         self._count += 1
         self._mux(frame)
 

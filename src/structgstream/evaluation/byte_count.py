@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
 from structgstream.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
@@ -57,6 +58,12 @@ def packet_rows(reader: StreamReader) -> list[Row]:
         )
         for info in infos
     ]
+
+
+def shown_seconds(frames: Sequence[PacketInfo | Row], fps: float) -> float:
+    """How long a stream of ``fps`` shows these frames, seconds: from the time of the first to that of the last, which
+    is farther where a live run left frames out between, and the distance of two frames; 0 without any."""
+    return frames[-1].pts_seconds - frames[0].pts_seconds + 1.0 / fps if frames else 0.0
 
 
 def with_rest(sizes: Mapping[str, int], whole: int) -> dict[str, int]:

@@ -271,8 +271,6 @@ class _Comparison:
                 truth=truth,
                 picture=picture,
                 before=last if number == index - 1 else None,
-                camera=camera,
-                index=index,
                 mask=mask,
             )
             self.before[camera] = index, now
@@ -325,6 +323,7 @@ def compared_frames(
         CaptureError: see :func:`evaluate`.
     """
     check_same_rig(recording.header, source, (camera,))
+    check_same_frames(recording, source)
     view = recording.header.camera(camera)
     for frame, (_, scene) in zip(select_cameras(source, (camera,)).frames(), recording.scenes(0)):
         picture = rendered(to_device(scene, backend.device), view, backend)[0]

@@ -2,11 +2,10 @@
 """Metrics with requirements: an optional package, weights, or the previous frame.
 
 If a requirement is missing, the metric is None, and the reason and its remedy are reported once. Temporal metrics
-compare consecutive frames of one camera by the optical flow between them; synthetic captures may provide exact flow:
-any :data:`Flow`.
+compare consecutive frames of one camera by the optical flow between them.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -20,7 +19,7 @@ from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
 from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, Mask, Picture, both, changed_pixels, ms_ssim
-from structgstream.flow import consistency_mask, dis_search, opencv, sampled
+from structgstream.flow import FlowSearch, consistency_mask, dis_search, sampled
 
 
 @dataclass(frozen=True)
@@ -32,20 +31,11 @@ class FlowField:
     seen: Mask  # [H, W] mask of the pixels that were not occluded in the frame before
 
 
-Flow = Callable[[Picture, Picture, str, int], FlowField]
-"""From truth of the previous frame, truth of this frame, camera name and frame number to this frame's flow field."""
-
-
-def dis_flow() -> Flow:
-    """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
-    Raises MissingExtraError if OpenCV is not installed."""
-    search = dis_search("eval")
-
-    def field(before: Picture, now: Picture, camera: str, index: int) -> FlowField:
-        backward = search(now, before)
-        return FlowField(backward, consistency_mask(backward, search(before, now)))
-
-    return field
+def flow_field(search: FlowSearch, before: Picture, now: Picture) -> FlowField:
+    """The flow between the truth of two frames, searched in both directions; consistent pixels
+    (``flow.consistency_mask``) count as seen."""
+    backward = search(now, before)
+    return FlowField(backward, consistency_mask(backward, search(before, now)))
 
 
 def warping_error(now: Picture, before: Picture, field: FlowField) -> float | None:
@@ -87,9 +77,8 @@ TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 class OptionalMetrics:
     """The available metrics, and the reasons for missing ones."""
 
-    flip: Callable[[Picture], FlipFeatures] | None  # computes FLIP's features of a picture, or None
+    search: FlowSearch | None  # finds optical flow; None without OpenCV, which FLIP needs, too
     lpips: Mapping[str, Lpips]  # the trunks whose weights were found, by name
-    flow: Flow | None  # backward flow, or None
     weights: Mapping[str, str] = field(default_factory=dict)  # the file of each trunk's weights, by name of the trunk
     not_available: Mapping[str, str] = field(default_factory=dict)  # the reason for each missing metric
 
@@ -114,17 +103,11 @@ def load_optional_metrics(
     """The metrics that are available here for these cameras (by name) and this number of frames: pictures must be large
     enough, and temporal metrics need two frames. Raises ConfigError if a file of weights is invalid."""
     missing: dict[str, str] = {}
-    measure = None
+    search = None
     try:
-        opencv("eval")
-        measure = features_of
+        search = dis_search("eval")
     except MissingExtraError as error:
-        missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
-    flow = None
-    try:
-        flow = dis_flow()
-    except MissingExtraError as error:
-        missing["e_warp"] = str(error)
+        missing |= dict.fromkeys(("flip", "temporal_flip", "e_warp"), str(error))
     sides = {name: min(camera.width, camera.height) for name, camera in cameras}
     found: dict[str, Lpips] = {}
     weights: dict[str, str] = {}
@@ -141,7 +124,7 @@ def load_optional_metrics(
         missing["ms_ssim"] = reason
     if frames < 2:
         missing |= dict.fromkeys(TEMPORAL, "the stream has one frame, and this score compares two")
-    return OptionalMetrics(measure, found, flow, weights, missing)
+    return OptionalMetrics(search, found, weights, missing)
 
 
 def optional_scores(
@@ -150,8 +133,6 @@ def optional_scores(
     truth: Picture,
     picture: Picture,
     before: ComparedFrame | None,
-    camera: str,
-    index: int,
     mask: Mask | None = None,
 ) -> tuple[dict[str, float | None], ComparedFrame]:
     """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
@@ -165,7 +146,7 @@ def optional_scores(
     """
     alex, vgg = (None if mask is not None else _usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
     scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth) if mask is None else None}
-    seen = None if optional_metrics.flip is None else (optional_metrics.flip(truth), optional_metrics.flip(picture))
+    seen = None if optional_metrics.search is None else (features_of(truth), features_of(picture))
     scores["flip"] = None if seen is None else flip_of(*seen, mask=mask)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
@@ -176,9 +157,8 @@ def optional_scores(
         still = still if counting is None else still & counting
         scores["flicker"] = flicker(picture, before.picture, still)
         scores["truth_flicker"] = flicker(truth, before.truth, still)
-        if optional_metrics.flow is not None:
-            field = optional_metrics.flow(before.truth, truth, camera, index)
-            field = _counting(field, mask, before.mask)
+        if optional_metrics.search is not None:
+            field = _counting(flow_field(optional_metrics.search, before.truth, truth), mask, before.mask)
             scores["e_warp"] = warping_error(picture, before.picture, field)
         if seen is not None and before.flip is not None and counting is None:
             true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))

@@ -80,9 +80,9 @@ def block_mask(mask: Mask, factor: int) -> Mask:
     return np.logical_and.reduce(blocks, axis=(1, 3))
 
 
-def thumbnail(picture: Picture, largest: int = LARGEST_TILE) -> Picture:
-    """``picture`` reduced by block means, by a whole factor, to at most ``largest`` pixels across."""
-    return block_means(picture, -(-picture.shape[1] // largest))
+def thumbnail(picture: Picture) -> Picture:
+    """``picture`` reduced by block means, by a whole factor, to at most :data:`LARGEST_TILE` pixels across."""
+    return block_means(picture, -(-picture.shape[1] // LARGEST_TILE))
 
 
 def spread_indices(count: int, columns: int) -> list[int]:

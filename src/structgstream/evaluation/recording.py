@@ -8,13 +8,15 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.open import open_capture
-from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized, section
+from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized_to, section
 from structgstream.data.video import VideoSource
 from structgstream.errors import BackendError, CaptureError, ConfigError
+from structgstream.evaluation.byte_count import shown_seconds
 from structgstream.evaluation.report import FrameScores
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene
@@ -91,13 +93,19 @@ def captures_of(
         CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
     whole = open_capture(folder, roving=False)  # they train frame 0, which the stream has
-    scale = _scale(header, whole)
-    return _part(resized(whole, scale), header, frames), _part(whole, header, frames) if scale < 1.0 else None
+    cameras = {name: _as_in(header.rig, name, camera) for name, camera in whole.rig.cameras.items()}
+    if all(cameras[name] is camera for name, camera in whole.rig.cameras.items()):
+        return _part(whole, header, frames), None
+    return _part(resized_to(whole, whole.rig.mapped(cameras)), header, frames), _part(whole, header, frames)
 
 
-def _scale(header: StreamHeader, whole: FrameSource) -> float:
-    shared = [name for name in header.rig if name in whole.rig.cameras]
-    return min(header.rig[shared[0]].width / whole.rig[shared[0]].width, 1.0) if shared else 1.0
+def _as_in(rig: CameraRig, name: str, camera: Camera) -> Camera:
+    """The capture's ``camera`` at its size in the stream's ``rig``, which is never enlarged. The stream's own numbers
+    are taken, because a scale that is found again from one rounded side may round the other differently."""
+    ours = rig.cameras.get(name, camera)
+    fits = ours.width <= camera.width and ours.height <= camera.height
+    is_smaller = fits and (ours.width, ours.height) != (camera.width, camera.height)
+    return camera.resized(ours.width, ours.height) if is_smaller else camera
 
 
 def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> FrameSource:
@@ -118,7 +126,7 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
         return header.rig.testing
     if unknown := [name for name in cameras if name not in header.rig.cameras]:
         raise ConfigError(f"The stream has no camera {unknown[0]!r}; it has {', '.join(header.rig)}.")
-    return cameras
+    return tuple(dict.fromkeys(cameras))
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
@@ -135,7 +143,8 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
         if (theirs.width, theirs.height) != (ours.width, ours.height):
             raise CaptureError(
                 f"Camera {name!r} has {theirs.width}x{theirs.height} pixels in the capture {source.name} and "
-                f"{ours.width}x{ours.height} in the stream; give the --scale of the reconstruction."
+                f"{ours.width}x{ours.height} in the stream; evaluate the stream on the capture it was made from, "
+                "opened at the same scale."
             )
         if not (torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4) and torch.allclose(theirs.K, ours.K, atol=0.1)):
             raise CaptureError(
@@ -145,14 +154,25 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
 
 
 def check_same_frames(recording: Recording, source: FrameSource) -> None:
-    """Check that the capture has the frames of the recording. Raises CaptureError if it has fewer, or both state their
-    start frame and step, and differ."""
+    """Check that the capture has the frames of the recording. Raises CaptureError if it has fewer, they are of other
+    times, or both state their start frame and step, and differ."""
     if len(source) < len(recording.packets):
         raise CaptureError(
             f"The stream has {len(recording.packets)} frames and this part of the capture {source.name} only "
             f"{len(source)}; evaluate it on the capture it was made from."
         )
-    theirs, metadata = numbers_of(source), recording.header.metadata
+    _check_numbers(recording.header, source)
+    for info in recording.packets:
+        if abs(info.pts_seconds - info.index / source.fps) > 0.5 / source.fps:
+            raise CaptureError(
+                f"Frame {info.index} of the stream is of {info.pts_seconds:.3f} s, and that of the capture "
+                f"{source.name} of {info.index / source.fps:.3f} s, so they cannot be compared; a live run leaves "
+                "frames out: reconstruct the capture, and evaluate that stream."
+            )
+
+
+def _check_numbers(header: StreamHeader, source: FrameSource) -> None:
+    theirs, metadata = numbers_of(source), header.metadata
     if theirs is None or metadata.get("start") is None:
         return
     start, every = int(metadata["start"]), int(metadata.get("every", 1))
@@ -181,7 +201,7 @@ def numbers_of(source: FrameSource) -> range | None:
 def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
     """Sizes and rates of the file. Bytes are lengths of records in the file; megabits are 10^6 bits."""
     header, packets = reader.header, reader.packets
-    seconds = len(packets) / header.fps
+    seconds = shown_seconds(packets, header.fps)
     packet_bytes = sum(info.bytes for info in packets)
     fields: dict[str, int] = {}
     for info in packets:

@@ -72,6 +72,11 @@ def argv_of(command: tuple[str, ...]) -> list[str]:
     return [sys.executable if word == PYTHON and not i else word for i, word in enumerate(command)]
 
 
+def tied_argv(command: tuple[str, ...]) -> list[str]:
+    """As :func:`argv_of`, of a process that is killed when this one ends (``launch.py``)."""
+    return [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid()), *argv_of(command)]
+
+
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
@@ -123,9 +128,8 @@ class CommandProcess:
         self._log = opened_log(task.log)
         self._began_at = self._log.tell()
         self._started = time.monotonic()
-        tied = [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid())]
         self._process = subprocess.Popen(
-            [*tied, *argv_of(task.command)],
+            tied_argv(task.command),
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,

@@ -34,7 +34,7 @@ FORMATS: Mapping[Format, FormatInfo] = {
         "SuperSplat, Brush, Postshot, Blender, Unity and Unreal importers",
     ),
     "splat": FormatInfo("oldest web viewers; one colour a Gaussian", "antimatter15/splat, Spark, Babylon.js", 0),
-    "spz": FormatInfo("small files for the web", "Niantic Scaniverse, Spark, PlayCanvas, Babylon.js, Cesium"),
+    "spz": FormatInfo("small files for the web", "Niantic Scaniverse, Spark, Babylon.js, Cesium"),
     "sog": FormatInfo("smallest files for the web", "PlayCanvas, SuperSplat, Spark"),
     "glb": FormatInfo(
         "glTF pipelines (KHR_gaussian_splatting)", "Khronos Sample Renderer, Cesium, Babylon.js, PlayCanvas, three.js"

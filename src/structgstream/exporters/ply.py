@@ -31,9 +31,9 @@ def properties(degree: int) -> list[str]:
     return ["x", "y", "z", "nx", "ny", "nz", *colors, "opacity", *shape]
 
 
-def ply_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
+def ply_bytes(gaussians: BakedGaussians, options: FrameOptions) -> bytes:
     """A whole ``.ply`` file, in the units and axes of ``gaussians``."""
-    if options is not None and options.pad_sh:
+    if options.pad_sh:
         missing = (MAX_SH_DEGREE + 1) ** 2 - gaussians.sh.shape[1]
         gaussians = replace(gaussians, sh=torch.nn.functional.pad(gaussians.sh, (0, 0, 0, missing)))
     names = properties(gaussians.degree)

@@ -40,14 +40,14 @@ from torch import Tensor
 
 from structgstream.errors import ConfigError, import_extra
 from structgstream.exporters.bake import BakedGaussians
-from structgstream.exporters.formats import FrameOptions, SpzVersion
+from structgstream.exporters.formats import FrameOptions
 from structgstream.scene.harmonics import Y0
 from structgstream.scene.order import morton_order
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def splat_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
+def splat_bytes(gaussians: BakedGaussians, options: FrameOptions) -> bytes:
     """A whole ``.splat`` file, in the units and axes of ``gaussians``.
 
     Raises:
@@ -85,10 +85,10 @@ def fractional_bits(means: Tensor) -> int:
     return min(MAX_FRACTIONAL_BITS, int(math.log2(LARGEST / max(farthest, 1.0))))
 
 
-def spz_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
+def spz_bytes(gaussians: BakedGaussians, options: FrameOptions) -> bytes:
     """A whole ``.spz`` file, in the units of ``gaussians`` (whose axes are OpenCV's) and the axes of the format. Raises
     ConfigError if a position does not fit."""
-    version: SpzVersion = 2 if options is None else options.spz_version
+    version = options.spz_version
     bits = fractional_bits(gaussians.means)
     gaussians = gaussians.y_up()
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
@@ -149,7 +149,7 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 
-def sog_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
+def sog_bytes(gaussians: BakedGaussians, options: FrameOptions) -> bytes:
     """A whole ``.sog`` file, in the units and axes of ``gaussians``. Raises MissingExtraError if Pillow is not
     installed."""
     gaussians = gaussians.select(morton_order(gaussians.means))
@@ -277,7 +277,7 @@ _FLOAT, _UNSIGNED_BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def glb_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
+def glb_bytes(gaussians: BakedGaussians, options: FrameOptions) -> bytes:
     """A whole ``.glb`` file, in the units of ``gaussians`` and the axes of glTF."""
     gaussians = gaussians.y_up()
     constant = (0.5 + Y0 * gaussians.sh[:, 0]).clamp(0.0, 1.0)

@@ -2,10 +2,10 @@
 """Bakes frames of a stream and writes them: to a file, a folder, a zip, or a file of all frames.
 
 Formats with all frames in one file are OpenUSD and ``.4dgs``; both have y up. OpenUSD has one prim
-``ParticleField3DGaussianSplat`` (OpenUSD 26.03) with a time sample of each frame. Time codes are frame numbers of the
-stream, and the stage has its frames per second. Scales and opacities are stored as they are, spherical harmonics
-Gaussian by Gaussian, the constant coefficient first. An older library than 26.03 writes the same prim and attributes
-without knowing their schema.
+``ParticleField3DGaussianSplat`` (OpenUSD 26.03) with a time sample of each frame. Time codes count frames at the
+stream's rate, which the stage has: they are frame numbers where no frame is left out. Scales and opacities are stored
+as they are, spherical harmonics Gaussian by Gaussian, the constant coefficient first. An older library than 26.03
+writes the same prim and attributes without knowing their schema.
 
 In ``.4dgs`` (Apache-2.0, https://4dgs.dev) each Gaussian lives from its frame to the next. The library quantizes
 positions, scales, rotations and colours within stated bounds, and coefficients above the constant one to 8 bits.
@@ -28,7 +28,7 @@ from structgstream.cameras import Camera
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError, StreamError, import_extra
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
-from structgstream.exporters.formats import FORMATS, Format, FrameOptions, is_one_file
+from structgstream.exporters.formats import FORMATS, SUFFIXES, Format, FrameOptions, is_one_file
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.web import glb_bytes, sog_bytes, splat_bytes, spz_bytes
 from structgstream.kernels.backend import Backend
@@ -73,10 +73,11 @@ class UsdFile:
         self._degree = prim.CreateAttribute(
             "radiance:sphericalHarmonicsDegree", types.Int, False, Sdf.VariabilityUniform
         )
-        self._numbers: list[int] = []
+        self._fps = fps
+        self._codes: list[float] = []
 
-    def add(self, number: int, gaussians: BakedGaussians) -> None:
-        """Add a frame: OpenCV axes, in the units of the file."""
+    def add(self, seconds: float, gaussians: BakedGaussians) -> None:
+        """Add the frame presented at ``seconds``: OpenCV axes, in the units of the file."""
         from pxr import Vt
 
         gaussians = gaussians.y_up()
@@ -90,15 +91,16 @@ class UsdFile:
             "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(_array(gaussians.sh.flatten(0, 1))),
             "extent": Vt.Vec3fArray.FromNumpy(_array(extent)),
         }
+        code = round(seconds * self._fps, 6)
         for name, value in samples.items():
-            self._attributes[name].Set(value, number)
+            self._attributes[name].Set(value, code)
         self._degree.Set(gaussians.degree)
-        self._numbers.append(number)
+        self._codes.append(code)
 
     def save(self, path: Path) -> None:
         """Write the file; its suffix says whether it is binary or text."""
-        self._stage.SetStartTimeCode(self._numbers[0])
-        self._stage.SetEndTimeCode(self._numbers[-1])
+        self._stage.SetStartTimeCode(self._codes[0])
+        self._stage.SetEndTimeCode(self._codes[-1])
         self._stage.GetRootLayer().Export(str(path))
 
 
@@ -114,18 +116,21 @@ class FourDgsFile:
         import_extra("fourdgs", "export")
         self._fps = fps
         self._frames: list[dict[str, np.ndarray]] = []
-        self._degree = 0
+        self._starts: list[float] = []  # of the frames, seconds after the first
+        self._first, self._degree = 0.0, 0
 
-    def add(self, number: int, gaussians: BakedGaussians) -> None:
-        """Add a frame: OpenCV axes, in the units of the file."""
+    def add(self, seconds: float, gaussians: BakedGaussians) -> None:
+        """Add the frame presented at ``seconds``: OpenCV axes, in the units of the file."""
         from fourdgs.quantization import SH_QUANT_HI, SH_QUANT_LO
 
         gaussians = gaussians.y_up()
         self._degree = gaussians.degree
-        place, count = len(self._frames), len(gaussians)
+        if not self._starts:
+            self._first = seconds
+        self._starts.append(seconds - self._first)
+        count = len(gaussians)
         rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1).cpu().numpy()
         color = (0.5 + Y0 * gaussians.sh[:, 0]).clamp(0.0, 1.0).cpu().numpy()
-        start = np.full(count, place / self._fps)
         self._frames.append(
             {
                 "positions": gaussians.means.cpu().numpy(),
@@ -133,9 +138,6 @@ class FourDgsFile:
                 "rotations": gaussians.quats[:, [1, 2, 3, 0]].cpu().numpy(),
                 "colors": np.concatenate([color, gaussians.opacities.cpu().numpy()[:, None]], axis=1),
                 "sh": np.rint((rest - SH_QUANT_LO) / (SH_QUANT_HI - SH_QUANT_LO) * 255).clip(0, 255).astype(np.uint8),
-                "win_lo": start,
-                "win_hi": np.full(count, (place + 1) / self._fps),
-                "mu_t": start,
                 "motions": np.zeros((count, 3)),
                 "sigma_t": np.full(count, np.inf),
             }
@@ -145,6 +147,10 @@ class FourDgsFile:
         """Write the file."""
         from fourdgs import GaussianSet, WriteOptions, write
 
+        duration = self._starts[-1] + 1 / self._fps
+        for frame, start, end in zip(self._frames, self._starts, [*self._starts[1:], duration], strict=True):
+            begins = np.full(len(frame["positions"]), start)
+            frame |= {"win_lo": begins, "win_hi": np.full_like(begins, end), "mu_t": begins}
         columns = {name: np.concatenate([frame[name] for frame in self._frames]) for name in self._frames[0]}
         exact = {"sh", "win_lo", "win_hi"}
         columns = {name: value if name in exact else value.astype(np.float32) for name, value in columns.items()}
@@ -152,7 +158,7 @@ class FourDgsFile:
             columns.pop("sh")
         metadata = {"coordinate_system": "y-up-right-handed", "color_space": "srgb-rec709-display"}
         options = WriteOptions(library="structgstream", metadata=metadata)
-        write(str(path), GaussianSet(**columns, sh_degree=self._degree), len(self._frames) / self._fps, options=options)
+        write(str(path), GaussianSet(**columns, sh_degree=self._degree), duration, options=options)
 
 
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians, FrameOptions], bytes]] = {
@@ -168,15 +174,16 @@ FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians, FrameOptions], bytes]] =
 class FramesFile(Protocol):
     """A file that contains all frames."""
 
-    def add(self, number: int, gaussians: BakedGaussians) -> None: ...
+    def add(self, seconds: float, gaussians: BakedGaussians) -> None: ...
 
     def save(self, path: Path) -> None: ...
 
 
 FRAMES_FILES: Mapping[Format, Callable[..., FramesFile]] = {"usd": UsdFile, "4dgs": FourDgsFile}
 """Formats with one file for all frames."""
-FrameWriter = Callable[[int, BakedGaussians], Path]
-"""Writes a frame, given its number, and returns the file that has it when the output is complete."""
+FrameWriter = Callable[[int, float, BakedGaussians], Path]
+"""Writes a frame, given its number and its time in seconds, and returns the file that has it when the output is
+complete."""
 
 
 @contextmanager
@@ -195,12 +202,12 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
     folder = output.is_dir()
     if FORMATS[format].all_frames:
         collected = FRAMES_FILES[format](fps=fps)
-        if folder:
+        if folder or SUFFIXES.get(output.suffix.lower().lstrip(".")) != format:
             output = output / f"frames.{format}"
 
-        def collect(number: int, gaussians: BakedGaussians) -> Path:
+        def collect(number: int, seconds: float, gaussians: BakedGaussians) -> Path:
             check_finite(gaussians)
-            collected.add(number, gaussians)
+            collected.add(seconds, gaussians)
             return output
 
         yield collect
@@ -209,7 +216,7 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
         output.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
 
-            def add(number: int, gaussians: BakedGaussians) -> Path:
+            def add(number: int, seconds: float, gaussians: BakedGaussians) -> Path:
                 check_finite(gaussians)
                 entry = zipfile.ZipInfo(frame_name(number, format))  # with a fixed date
                 entry.compress_type = zipfile.ZIP_DEFLATED
@@ -219,7 +226,7 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
             yield add
     else:
         single = is_one_file(output)
-        yield lambda number, gaussians: write_gaussians(
+        yield lambda number, seconds, gaussians: write_gaussians(
             output if single else output / frame_name(number, format), gaussians, format=format, options=options
         )
 
@@ -332,7 +339,8 @@ def write_frames(
             if options.low_pass and scene.sampling is not None:
                 baked = with_low_pass(baked, scene.sampling, options.low_pass)
             plain = selected(baked.in_capture_units(header.similarity), options)
-            yield WrittenFrame(write(number, plain), len(plain), loss)
+            seconds = reader.packets.at(number).pts_seconds
+            yield WrittenFrame(write(number, seconds, plain), len(plain), loss)
 
 
 def selected(gaussians: BakedGaussians, options: FrameOptions) -> BakedGaussians:

@@ -41,7 +41,7 @@ class GroupBase:
         if init is None or init.type != RecordType.INIT or first is None or first.type != RecordType.KEY:
             raise StreamError(
                 f"{path} has no whole frame 0 at its beginning; make it with: structgstream reconstruct CAPTURE "
-                f"--frames 1 -o {path} --overwrite"
+                f"--frames 1 --sound none -o {path} --overwrite"
             )
         head, record = bytes(data[: init.end]), bytes(data[init.end : first.end])
         data.close()
@@ -56,17 +56,13 @@ class GroupBase:
     @cached_property
     def config(self) -> StreamConfig:
         """The configuration of the stream, which is that of every group. Raises ConfigError if it cannot be read, has
-        periods, or was made without scene flow, which groups need."""
+        periods or sound, or was made without scene flow, which groups need."""
         config = from_json(self.header.config)
-        if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
+        check_for_groups(config, name=self.name)
+        if self.header.sound is not None:
             raise ConfigError(
-                f"{self.name} was made with codec {config.codec} and scene flow "
-                f"{'on' if config.online.scene_flow.enabled else 'off'}; groups need the codec compact and scene flow, "
-                "as in the presets compact and fast."
-            )
-        if config.period.enabled:
-            raise ConfigError(
-                f"{self.name} may begin other periods, and groups share one header; make it without them."
+                f"{self.name} has sound, which groups do not carry; make it with --sound none, and give the joined "
+                "stream its sound with structgstream add-sound."
             )
         return config
 
@@ -83,6 +79,19 @@ class GroupBase:
     def scene(self) -> Scene:
         """The decoded frame 0, on the CPU."""
         return SceneDecoder(self.header).decode(self.packet)
+
+
+def check_for_groups(config: StreamConfig, *, name: str) -> None:
+    """Check that groups can be fitted with the configuration of ``name``. Raises ConfigError if it has another codec,
+    no scene flow, or periods."""
+    if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
+        raise ConfigError(
+            f"{name} has codec {config.codec} and scene flow "
+            f"{'on' if config.online.scene_flow.enabled else 'off'}; groups need the codec compact and scene flow, "
+            "as in the presets compact and fast."
+        )
+    if config.period.enabled:
+        raise ConfigError(f"{name} may begin other periods, and groups share one header; make it without them.")
 
 
 def open_for(header: StreamHeader, folder: Path, *, frames: int | None) -> FrameSource:

@@ -190,7 +190,7 @@ def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
         identity = segment.identity
         if not segment.complete:
             raise StreamError(
-                f"{path} is not finished or damaged: {segment.reason}. Run its reconstruct command again, then join."
+                f"{path} is not finished or damaged: {segment.reason}. Run its fit-group command again, then join."
             )
         if segment.init != first.init or identity.header != first.identity.header:
             raise ConfigError(f"{path} has another header than {first_path}; join groups of one header.")

@@ -166,6 +166,8 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
             f"{path} is a track of another {' and '.join(differing)}; give the same header, capture and options, "
             "another name, or --overwrite."
         )
+    if found.groups is None and path.exists():
+        path.replace(partial_path(path))  # A finished track that was damaged at its end becomes an unfinished one.
     return found
 
 

@@ -115,7 +115,6 @@ class Tracked:
 
     scene: Scene  # the displaced scene
     velocities: Tensor  # [M + F, 3] displacements by the last frame
-    moved: int = 0  # number of primitives that the last frame displaced
 
     @classmethod
     def at_rest(cls, scene: Scene) -> "Tracked":
@@ -157,7 +156,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
                 backend=tracker.backend,
             )
             velocities[primitives] += again.displacements
-    return Tracked(with_displacements(past.scene, velocities), velocities, len(primitives))
+    return Tracked(with_displacements(past.scene, velocities), velocities)
 
 
 @dataclass(frozen=True)

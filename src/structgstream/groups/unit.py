@@ -67,7 +67,6 @@ class GroupMethod:
     start: GroupStartConfig  # configuration of the first frame's fit
     entry: GroupEntry | None  # start of the group; None for the group of frame 0, which is fitted as any stream
     lowered: bool = False  # whether the budget has been lowered
-    _first: MultiViewFrame | None = field(default=None, repr=False)
 
     @property
     def _usual(self) -> StructGStream:

@@ -51,8 +51,8 @@ class Unit:
     track: tuple[str, ...] = ()  # further arguments of track: length of groups
     # threads of the tracking pass, which all groups wait for; None for those of its worker slot
     track_threads: int | None = None
-    device: tuple[str, ...] = ()  # further arguments of all commands: the back-end
-    join: tuple[str, ...] = ()  # further arguments of join: number of processes
+    device: tuple[str, ...] = ()  # further arguments of all commands but join: the back-end
+    join: tuple[str, ...] = ()  # further arguments of join, which runs here: the back-end, number of processes
     program: tuple[str, ...] = PROGRAM  # runs the commands
     # the frames at which a group may start, of a track that is finished or growing
     starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
@@ -62,7 +62,8 @@ class Unit:
     def header_task(self, parts: Parts) -> Task:
         """Fits frame 0, which all groups share."""
         argv = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
-        return Task(HEADER, (*argv, *self.header, *self.device), str(parts.header), parts.log(HEADER))
+        command = (*argv, "--sound", "none", *self.header, *self.device)  # groups carry no sound
+        return Task(HEADER, command, str(parts.header), parts.log(HEADER))
 
     def track_task(self, parts: Parts) -> Task:
         """The tracking pass."""
@@ -82,7 +83,7 @@ class Unit:
     def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
         """Joins all segments to the stream."""
         segments = [str(parts.segment(first, end)) for first, end in groups]
-        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device, *self.join)
+        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.join)
         return Task(JOIN, command, str(output), parts.log(JOIN))
 
 
@@ -270,8 +271,9 @@ class _Drive:
         if self._parts.is_complete(JOIN, key, output):
             self._show()
             return groups
-        with TaskQueue(LocalEngine([WorkerSlot(1)])) as here:
-            made = self._alone(here, self._unit.join_task(self._parts, groups, output))
+        gpus = self._job.gpus
+        with TaskQueue(LocalEngine([WorkerSlot(1, 0 if gpus else None)])) as here:
+            made = self._alone(here, self._unit.join_task(self._parts, groups, output), gpus=gpus)
         self._parts.record(made, key, output, frames=groups[-1][1])
         return groups
 

@@ -25,7 +25,7 @@ from typing import TypeVar
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import ConfigError, StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
-from structgstream.executors.tasks import PYTHON, Task, argv_of
+from structgstream.executors.tasks import PYTHON, Task, tied_argv
 from structgstream.groups.track_file import groups_path
 from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
 from structgstream.parallel.parts import PART_NAMES, Parts
@@ -292,7 +292,8 @@ def run(transfer: Transfer, command: Sequence[str]) -> int:
     if not all((staging.folder / name).exists() for name in transfer.gives):
         for name in transfer.grows:
             staging.fetch(name)
-    process = subprocess.Popen(argv_of(tuple(argument.replace(HERE, str(staging.folder)) for argument in command)))
+    # Tied, because a command that outlives this process would hold the folder in which the next attempt continues.
+    process = subprocess.Popen(tied_argv(tuple(argument.replace(HERE, str(staging.folder)) for argument in command)))
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):

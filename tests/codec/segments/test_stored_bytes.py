@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.codec.segments.manifest import MANIFEST, manifest_to_json
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments
 from structgstream.errors import StreamError
@@ -116,6 +117,9 @@ def test_what_is_a_stream_of_segments(tmp_path: Path) -> None:
     assert is_segments(tmp_path / MANIFEST)
     assert not is_segments(tmp_path / "ball.sgs")
     with pytest.raises(StreamError, match=r"has no manifest.json; expected a folder written with --sink segments"):
+        open_segments(tmp_path)
+    write_list(tmp_path, [ListedQuality(name, f"{name}/manifest.json", 1e6) for name in ("low", "high")])
+    with pytest.raises(StreamError, match=f"give the folder of one: {tmp_path}/low, {tmp_path}/high"):
         open_segments(tmp_path)
     (tmp_path / MANIFEST).write_text("{}")
     with pytest.raises(StreamError, match=f"manifest.json in {tmp_path} has no 'format'"):

@@ -28,6 +28,7 @@ from structgstream.codec.segments.manifest import (
     page_to_json,
     sha256_of,
 )
+from structgstream.codec.segments.quality_list import read_list
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
 
@@ -283,6 +284,9 @@ def open_segments(path: Path | str) -> StoredBytes:
     missing."""
     path = Path(path)
     store = FolderStore(path.parent if path.name == MANIFEST else path)
+    if not (path / MANIFEST).exists() and (listed := read_list(path)) is not None:
+        folders = ", ".join(str(path / one.folder) for one in listed if one.folder)
+        raise StreamError(f"{path} holds several qualities of one stream; give the folder of one: {folders}.")
     return StoredBytes(store, read_manifest(store))
 
 
