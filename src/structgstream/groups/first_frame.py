@@ -289,7 +289,6 @@ class _Rounds:
             seen,
             find_active_tiles(split, seen, config=config.motion, backend=fit.backend),
             scale=config.motion.picture_scale,
-            config=config.scene_flow,
             backend=fit.backend,
         )
         return split.displaced(found.displacements), int(found.lifted.sum())
