@@ -46,7 +46,7 @@ def recalled(scene: Scene) -> tuple[torch.Tensor, int]:
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
-        rules=SpawnRules(picture_width=96),
+        rules=SpawnRules(longer_side=96),
         backend=BACKEND,
     )
     return moving.anchors.positions, count

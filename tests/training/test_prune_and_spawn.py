@@ -156,7 +156,7 @@ THIN = varied(
     ThinSpawnConfig(enabled=True),
     RULES=replace(
         ThinSpawnConfig.RULES,
-        picture_width=96,
+        longer_side=96,
         missing_threshold=0.10 / 9,
         max_contradictions=0.34,
         max_cost=0.12,
