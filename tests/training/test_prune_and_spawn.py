@@ -21,7 +21,7 @@ from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2))
+CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2, planes=96))  # so small a ball needs more depths
 BACKENDS = [
     pytest.param(reference_backend, id="reference"),
     pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
