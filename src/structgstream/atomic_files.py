@@ -142,7 +142,7 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
 
 
 @contextmanager
-def named_when_whole(path: Path) -> Iterator[Path]:
+def renamed_on_success(path: Path) -> Iterator[Path]:
     """The partial file to which the block writes what gets the name ``path`` at its end, unless it raises.
 
     For writers that open and lock their file themselves. Raises StorageError if the file cannot be renamed.

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from structgstream.atomic_files import named_when_whole
+from structgstream.atomic_files import renamed_on_success
 from structgstream.cameras import Camera, CameraRig, normalizing_similarity
 from structgstream.codec.fields.packet_fields import MAX_FREE
 from structgstream.codec.fields.quantization import LARGEST, float32
@@ -137,13 +137,13 @@ def import_sequence(
     psnr = color_psnr = math.inf
     quats = first.quats[chosen]
     counts, far = [], []
-    with named_when_whole(output) as part, closing(FileSink(part, overwrite=True)) as sink:
+    with renamed_on_success(output) as part, closing(FileSink(part, overwrite=True)) as sink:
         sink.open(header)
         for index, file in enumerate(files):
             whole = first if index == 0 else in_scene(read_ply(file))
             gaussians = whole.select(chosen if linked else _chosen(whole, max_splats, reach))
             counts.append(len(gaussians))
-            far.append(int((whole.means.abs().amax(1) > reach).sum()))
+            far.append(0 if linked and index else int((whole.means.abs().amax(1) > reach).sum()))
             if linked:  # a quaternion and its negative are the same rotation
                 same_side = torch.where((gaussians.quats * quats).sum(1, keepdim=True) < 0, -1.0, 1.0)
                 quats = gaussians.quats * same_side

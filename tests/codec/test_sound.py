@@ -133,10 +133,10 @@ def test_a_damaged_sound_costs_no_frame() -> None:
 def test_sound_is_found_behind_the_layers_of_a_packet() -> None:
     records = [*scan_records(data := whole_stream())]
     packet = next(record for record in records if record.type in (RecordType.KEY, RecordType.DELTA))
-    layer = packed(16, b"refines")
-    layered = StreamReader(data[: packet.end] + 2 * layer + data[packet.end : records[-1].offset])
+    between = packed(16, b"refines") + packed(64, b"a note")
+    layered = StreamReader(data[: packet.end] + between + data[packet.end : records[-1].offset])
     assert [layered.sound(index) for index in range(FRAMES)] == sounds()
-    assert layered.packets[0].bytes == StreamReader(data).packets[0].bytes + 2 * len(layer)
+    assert layered.packets[0].bytes == StreamReader(data).packets[0].bytes + len(between)
 
 
 def test_a_file_that_is_cut_anywhere_is_continued_to_the_same_bytes(tmp_path: Path) -> None:

@@ -233,12 +233,14 @@ def test_a_truncated_video_is_found_at_once(tmp_path: Path, kept: float) -> None
         read(tmp_path)
 
 
-def damaged(folder: Path, *, suffix: str = "mp4", share: float = 0.6) -> VideoSource:
+def damaged(
+    folder: Path, *, suffix: str = "mp4", share: float = 0.6, options: dict[str, str] | None = None
+) -> VideoSource:
     """Videos of noise, large, so that damage hits data; that of ``cam01`` is broken from ``share`` of it on."""
     rng = np.random.default_rng(3)
     noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(24)]
     for name in RIG:
-        write_video(folder / f"{name}.{suffix}", noise)
+        write_video(folder / f"{name}.{suffix}", noise, options=options)
     data = bytearray((folder / f"cam01.{suffix}").read_bytes())
     middle = int(len(data) * share)
     for at in range(middle, middle + 4000):
@@ -262,6 +264,16 @@ def test_a_damage_makes_its_camera_absent_up_to_the_next_key_frame(
     assert f"absent until {(lost[-1] + 1) / 30:.3f} s" in reported
     list(source.frames())
     assert sum("decoded" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_after_damage_a_transport_stream_with_b_frames_is_read_on(tmp_path: Path) -> None:
+    """Seeking its key frames lands behind them."""
+    options = {"crf": "20", "g": "8", "bf": "3", "x264-params": "scenecut=0:keyint=8:min-keyint=8"}
+    source = damaged(tmp_path, suffix="ts", share=0.3, options=options)
+    present = ["cam01" in frame.images for frame in source.frames()]
+    assert not all(present)
+    assert all(present[:4])
+    assert all(present[-8:])
 
 
 def test_a_broken_key_frame_costs_its_group_alone(tmp_path: Path) -> None:

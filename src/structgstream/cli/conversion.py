@@ -312,7 +312,7 @@ def add_sound(arguments: list[str]) -> None:
     output = options.output
     check_ending(output, ".sgs", command="add-sound")
     check_new(output, overwrite=options.overwrite)
-    from structgstream.atomic_files import named_when_whole
+    from structgstream.atomic_files import renamed_on_success
     from structgstream.codec.reader import open_stream
     from structgstream.codec.sinks import FileSink
     from structgstream.evaluation.recording import capture_of
@@ -326,6 +326,6 @@ def add_sound(arguments: list[str]) -> None:
         sound = chosen_sound(source, options.capture, options.sound, offset_seconds=options.sound_offset)
         if sound is None:
             raise UsageError("--sound none adds nothing; name a camera or a file.")
-        with named_when_whole(output) as part:  # half a stream would look like a shorter one
+        with renamed_on_success(output) as part:  # half a stream would look like a shorter one
             copy_with_sound(reader, FileSink(part, overwrite=True), sound, name=str(options.stream))
     print_lines(Console(), f"Wrote {output}: {frames_text(len(reader))}, sound of {sound.name}")

@@ -17,7 +17,6 @@ from structgstream.codec.container.records import (
     CHECKSUM,
     FRAME,
     INDEX_ENTRY,
-    LAYER_TYPES,
     PACKET_KINDS,
     PREFIX,
     RECORD,
@@ -39,6 +38,7 @@ from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_
 from structgstream.codec.sound import FrameSound, unpack_sound
 from structgstream.errors import StreamError
 
+_KNOWN_TYPES = frozenset(RecordType)
 MIN_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
 _ZSTD = bytes.fromhex("28b52ffd")  # which an init record's description begins with
 _CHUNK_BYTES = 2**20
@@ -277,9 +277,10 @@ class Packets(Sequence[PacketInfo]):
         return sound if sound.index == index else None
 
     def _sound_head(self, end: int) -> tuple[int, Head] | None:
-        """Offset and head of the sound record of the packet that ends at byte ``end``, behind its layers."""
+        """Offset and head of the sound record of the packet that ends at byte ``end``, behind records of unknown types
+        such as layers."""
         head = read_head(self._data, end)
-        while head is not None and head.type in LAYER_TYPES:
+        while head is not None and head.type not in _KNOWN_TYPES:
             end += head.bytes
             head = read_head(self._data, end)
         return None if head is None or head.type != RecordType.SOUND else (end, head)

@@ -271,7 +271,7 @@ def is_cut_jpeg(data: bytes) -> bool:
 
 
 def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A picture of HEIC, turned as it is shown, or of AVIF, as it is stored, as PNG."""
+    """A HEIC or AVIF picture as PNG: HEIC is turned as it is shown, AVIF remains as it is stored."""
     is_avif = data[8:12] in (b"avif", b"avis")
     needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
     missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")

@@ -123,8 +123,8 @@ class WithRoving(SourceWrapper):
         count = min(INSTANTS, len(self.whole))
         for index in np.linspace(0, len(self.whole) - 1, count).round().astype(int).tolist():
             with closed(self.whole.frames(index)) as frames:
-                shown = next(frames)
-            for name in seen.keys() & shown.images.keys():
+                shown = next(frames, None)
+            for name in seen.keys() & ({} if shown is None else shown.images).keys():
                 seen[name].append(reduced(shown.images[name]))
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 

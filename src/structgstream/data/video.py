@@ -252,9 +252,9 @@ def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Gen
     """The frames at the time stamps ``wanted``, without those that are lost (Note [Damaged videos])."""
     if not wanted:
         return
-    at, begin, restarted = 0, _key_before(track, wanted[0]), False
+    at, begin, early, restarted = 0, _key_before(track, wanted[0]), False, False
     while at < len(wanted):
-        run = _Run(track, begin)
+        run = _Run(track, begin, early)
         with closing(run.frames()) as frames:
             for frame in frames:
                 if frame.pts == wanted[at]:
@@ -262,10 +262,14 @@ def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Gen
                     yield frame
                     if at == len(wanted):
                         return
-        if begin is not None and not run.met and not restarted:
-            # Without an index the seek may miss the key frame (MPEG), which may also not decode alone (intra refresh).
-            begin, restarted = None, True
-            continue
+        if begin is not None and not run.met:
+            if not early:  # Without an index the seek may land behind the key frame (MPEG).
+                early = True
+                continue
+            if not restarted:  # It may not decode alone (intra refresh).
+                begin, early, restarted = None, False, True
+                continue
+        early = False
         following = bisect_right(track.keyframes, run.lost if begin is None else max(run.lost, begin))
         begin = track.keyframes[following] if following < len(track.keyframes) else None
         on_damage(run.lost, begin, run.reason)
@@ -282,6 +286,7 @@ class _Run:
 
     track: VideoTrack  # the video
     begin: int | None  # time stamp of a key frame; None for the beginning
+    early: bool = False  # whether to seek the key frame before that
     expected: int = 0  # number of the next frame in the video's order
     met: bool = False  # whether the frame at ``begin`` came
     reason: str = "a frame is missing or broken"  # why it ended
@@ -303,7 +308,9 @@ class _Run:
             reordered = container.format.name == "avi" and stream.codec_context.has_b_frames
             try:
                 if begin is not None:
-                    container.seek(begin, stream=stream, backward=True)
+                    earlier = _key_before(self.track, begin - 1)
+                    target = begin if not self.early else stamps[0] if earlier is None else earlier
+                    container.seek(target, stream=stream, backward=True)
                 for frame in _frames_from_key(container, stream, any_frame=not self.track.keyframes):
                     if frame.pts is None or frame.pts < (stamps[0] if begin is None else begin):
                         continue  # cut by the container's edit list, or before the key frame

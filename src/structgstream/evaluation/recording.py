@@ -166,8 +166,9 @@ def check_same_frames(recording: Recording, source: FrameSource) -> None:
         if abs(info.pts_seconds - info.index / source.fps) > 0.5 / source.fps:
             raise CaptureError(
                 f"Frame {info.index} of the stream is of {info.pts_seconds:.3f} s, and that of the capture "
-                f"{source.name} of {info.index / source.fps:.3f} s, so they cannot be compared; a live run leaves "
-                "frames out: reconstruct the capture, and evaluate that stream."
+                f"{source.name} of {info.index / source.fps:.3f} s (at {recording.header.fps:g} and {source.fps:g} "
+                "frames a second), so they cannot be compared; a live run leaves frames out: reconstruct the capture, "
+                "and evaluate that stream."
             )
 
 

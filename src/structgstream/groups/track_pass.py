@@ -16,7 +16,7 @@ from torch import Tensor
 
 from structgstream.atomic_files import name_finished, partial_path
 from structgstream.data.source import FrameSource, read_ahead
-from structgstream.errors import ConfigError, StreamError
+from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.groups.base import GroupBase, fingerprint
 from structgstream.groups.segment_file import GroupSoFar, Segment
 from structgstream.groups.track_file import (
@@ -167,7 +167,10 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
             "another name, or --overwrite."
         )
     if found.groups is None and path.exists():
-        path.replace(partial_path(path))  # A finished track that was damaged at its end becomes an unfinished one.
+        try:
+            path.replace(partial_path(path))  # A finished track that was damaged at its end becomes an unfinished one.
+        except OSError as error:
+            raise StorageError(f"{path} cannot be renamed ({error.strerror}); correct its permissions.") from None
     return found
 
 

@@ -38,10 +38,6 @@ class RecordType(IntEnum):
     SOUND = 32
 
 
-LAYER_TYPES = range(16, 32)
-"""Types reserved for layers, which lie between a packet and its sound."""
-
-
 class PacketKind(IntEnum):
     """A key packet needs only the header; a delta packet also needs the packet before it."""
 

@@ -285,7 +285,7 @@ def open_segments(path: Path | str) -> StoredBytes:
     path = Path(path)
     store = FolderStore(path.parent if path.name == MANIFEST else path)
     if not (path / MANIFEST).exists() and (listed := read_list(path)) is not None:
-        folders = ", ".join(str(path / one.folder) for one in listed if one.folder)
+        folders = ", ".join(str((path / one.manifest).parent) for one in listed)
         raise StreamError(f"{path} holds several qualities of one stream; give the folder of one: {folders}.")
     return StoredBytes(store, read_manifest(store))
 

@@ -114,9 +114,17 @@ class Recording:
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
             write_prepared(folder, capture.only(known) if known else capture)
             for name in files:
-                if (mask := lasting_mask(self._masks, name)) is not None:
-                    atomic_write(folder / FOLDER / f"{name}.png", mask.read_bytes(), called="The mask", new_folder=True)
+                self._copy_mask(name, folder / FOLDER)
             return folder
+
+    def _copy_mask(self, name: str, folder: Path) -> None:
+        try:
+            mask = lasting_mask(self._masks, name)
+            content = None if mask is None else mask.read_bytes()
+        except OSError as error:
+            raise StorageError(f"The masks in {self._masks} cannot be read ({error.strerror}).") from None
+        if content is not None:
+            atomic_write(folder / f"{name}.png", content, called="The mask", new_folder=True)
 
     def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
         """Records which instant became which frame of the stream."""

@@ -21,8 +21,8 @@ from structgstream.data.live.status import Fault
 
 MIN_SPACING = 0.75
 """Minimum share of a frame period between two instants: of a faster reference camera, pictures are left out."""
-MAX_LATE_SECONDS = 5.0
-"""Later than its reference no picture comes: a connection that stalls for so long is opened again."""
+MAX_LATE_SECONDS = 60.0
+"""Later than its reference no picture comes: a connection that stalls is opened again before (``silent_seconds``)."""
 
 
 @dataclass(frozen=True)
