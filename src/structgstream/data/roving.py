@@ -124,8 +124,9 @@ class WithRoving(SourceWrapper):
         for index in np.linspace(0, len(self.whole) - 1, count).round().astype(int).tolist():
             with closed(self.whole.frames(index)) as frames:
                 shown = next(frames, None)
-            for name in seen.keys() & ({} if shown is None else shown.images).keys():
-                seen[name].append(reduced(shown.images[name]))
+            images = {} if shown is None else shown.images
+            for name in seen.keys() & images.keys():
+                seen[name].append(reduced(images[name]))
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
