@@ -22,6 +22,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     expect(stage.server.rangesOf("/clip.sgs")).toEqual([
       [0, 4096],
       [CLIP.length - 4096, CLIP.length],
+      [PACKETS[LAST]!.offset, PACKETS[LAST]!.offset + 20],
       [4096, PACKETS[0]!.offset + PACKETS[0]!.bytes],
     ]);
     expect(await ask(page, (player) => [player.duration.toFixed(3), player.paused, player.cameras.length])).toEqual([
