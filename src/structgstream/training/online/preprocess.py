@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import CameraRig, enlargement
+from structgstream.cameras import CameraRig
 from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search, same_color
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, on_processor
@@ -283,7 +283,6 @@ def flow_map(
     where = changed.numpy()
     longer = max(where.shape)
     level = 1 if longer // 2 >= MIN_SEARCH_PIXELS else 0
-    absolute = ABSOLUTE * enlargement(*where.shape) ** 2
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
     radius = max(1, round(COLOR_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
@@ -300,7 +299,7 @@ def flow_map(
         recolored_pixels += int(where[box][~alike.numpy()].sum())
         counts = alike if mask is None else alike & mask[box]
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
-        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=absolute)
+        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
 
     cell = max(1, round(longer / CELLS))
     for box in _boxes(where, context):
