@@ -38,7 +38,7 @@ MAX_PERIODS = 3
 """Tables of the fields of headers are printed for so many periods; ``--json`` has all."""
 PICTURES = (".png", ".svg", ".pdf")
 STREAM_FILES = ("manifest.json", "qualities.json")
-"""Names by which the folder of a stream is told from that of a capture."""
+"""A folder with one of these files is a stream; any other is a capture."""
 
 
 @dataclass(frozen=True)
