@@ -23,6 +23,8 @@ int sgs_cuda_l1_ssim_backward(
     float* gradient, void* stream);
 /* The meaning of an error number. */
 const char* sgs_cuda_error(int error);
+/* 1 if the driver runs the CUDA version that this library was compiled with, else 0. Needs no GPU. */
+int sgs_cuda_driver_fits(void);
 
 #ifdef __cplusplus
 }

@@ -112,7 +112,13 @@ int sgs_cuda_l1_ssim_backward(
 
 #ifdef __CUDACC__
 const char* sgs_cuda_error(int error) { return cudaGetErrorString(static_cast<cudaError_t>(error)); }
+int sgs_cuda_driver_fits(void) {
+    int driver = 0, runtime = 0;
+    if (cudaDriverGetVersion(&driver) != cudaSuccess || cudaRuntimeGetVersion(&runtime) != cudaSuccess) return 0;
+    return driver / 1000 >= runtime / 1000;  // A driver runs all minor versions of its major version.
+}
 #else
+int sgs_cuda_driver_fits(void) { return 1; }
 const char* sgs_cuda_error(int) { return "the emulation does not fail"; }
 #endif
 

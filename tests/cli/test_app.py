@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+import torch
 
 import structgstream
 from structgstream.cli import app
@@ -64,9 +65,15 @@ def test_a_problem_is_one_sentence_without_a_traceback(command, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    "error", [OutOfMemoryError("to lift flow"), MemoryError(), MemoryError("Unable to allocate 3 TiB")]
+    "error",
+    [
+        OutOfMemoryError("to lift flow"),
+        MemoryError(),
+        MemoryError("Unable to allocate 3 TiB"),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\nGPU 0 has"),
+    ],
 )
-def test_exhausted_memory_is_one_sentence(command, error: MemoryError, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exhausted_memory_is_one_sentence(command, error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
     command(raising(error))
     assert main(["reconstruct"]) == 1
     text = capsys.readouterr().err

@@ -27,6 +27,10 @@ def test_without_a_native_library_it_says_so_once_and_works(
 
 
 def test_a_named_backend_that_is_missing_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def old_driver() -> None:
+        raise RuntimeError("The NVIDIA driver on your system is too old (found version 11040). Please update your GPU")
+
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(BackendError, match="sees no NVIDIA GPU"):
+    monkeypatch.setattr("torch.cuda.init", old_driver)
+    with pytest.raises(BackendError, match=r"an NVIDIA GPU \(The NVIDIA driver .* \(found version 11040\)\);"):
         backend.select_backend("cuda")

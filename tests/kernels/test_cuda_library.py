@@ -3,7 +3,11 @@
 
 import ctypes
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -38,6 +42,7 @@ def test_the_sources_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     library = ctypes.CDLL(str(path))  # CUDA's runtime is linked in, so it loads without a GPU.
     for name in CUDA_PROTOTYPES:
         assert hasattr(library, name)
+    assert library.sgs_cuda_driver_fits() in (0, 1)
     library.sgs_cuda_error.restype = ctypes.c_char_p
     assert library.sgs_cuda_error(ctypes.c_int(1)) == b"invalid argument"
 
@@ -98,16 +103,62 @@ def test_where_libraries_are_kept(tmp_path: Path) -> None:
     assert cuda_library.cache_folder({}) == Path.home() / ".cache" / "structgstream" / "cuda"
 
 
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """A machine that says it has a GPU; returns the path of the kernels that its package carries."""
+
+    def pretend(*, nvcc: Path | None, capability: tuple[int, int] = (9, 0)) -> Path:
+        packaged = tmp_path / "libstructgstream_cuda.so"
+        monkeypatch.setattr(cuda_library, "find_nvcc", lambda environment: nvcc)
+        monkeypatch.setattr(cuda_library, "source_folder", lambda: SOURCES)
+        monkeypatch.setattr(cuda_library, "cache_folder", lambda environment: tmp_path / "cache")
+        monkeypatch.setattr(cuda_library, "packaged_path", lambda: packaged)
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        cuda_library.kernel_library.cache_clear()
+        return packaged
+
+    return pretend
+
+
 @pytest.mark.parametrize("found", [False, True])
-def test_without_kernels_it_says_why(found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_kernels_it_says_why(found: bool, tmp_path: Path, machine: Callable[..., Path]) -> None:
     broken = pretended(tmp_path / "bin", 'echo "no host compiler" >&2; exit 1')
-    monkeypatch.setattr(cuda_library, "find_nvcc", lambda environment: broken if found else None)
-    monkeypatch.setattr(cuda_library, "source_folder", lambda: SOURCES)
-    monkeypatch.setattr(cuda_library, "cache_folder", lambda environment: tmp_path / "cache")
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    cuda_library.kernel_library.cache_clear()
+    machine(nvcc=broken if found else None)
     with pytest.raises(BackendError, match="no host compiler" if found else "put nvcc on PATH"):
         cuda_library.kernel_library()
     reason = cuda.cuda_reason()
     assert reason is None if found else "put nvcc on PATH" in str(reason)
+
+
+def test_a_wheel_with_kernels_needs_no_compiler(machine: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    packaged = machine(nvcc=None)
+    packaged.write_bytes(b"")
+    functions: Any = SimpleNamespace(**{name: lambda: 1 for name in CUDA_PROTOTYPES})
+    monkeypatch.setattr(ctypes, "CDLL", lambda path: functions)
+    assert cuda.cuda_reason() is None
+    assert cuda_library.kernel_library().library is functions
+
+
+@pytest.mark.parametrize(
+    ("capability", "driver_fits", "reason"),
+    [
+        ((7, 5), True, r"need a GPU of compute capability 8\.0, and this one has 7\.5\. To compile them, install"),
+        ((9, 0), False, r"driver of the GPU is older than the compiled CUDA kernels need; update it\. To compile"),
+        ((9, 0), None, r"compiled CUDA kernels do not load \(.*file too short\)\. To compile"),
+    ],
+)
+def test_kernels_of_a_wheel_that_do_not_fit(
+    capability: tuple[int, int],
+    driver_fits: bool | None,
+    reason: str,
+    machine: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine(nvcc=None, capability=capability).write_bytes(b"")
+    if driver_fits is not None:
+        functions = SimpleNamespace(**{name: lambda: int(driver_fits) for name in CUDA_PROTOTYPES})
+        monkeypatch.setattr(ctypes, "CDLL", lambda path: functions)
+    assert re.search(reason, str(cuda.cuda_reason()))
+    with pytest.raises(BackendError, match=reason):
+        cuda_library.kernel_library()

@@ -126,7 +126,7 @@ def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_memory_on_the_gpu() -> None:
     names = {name: SimpleNamespace() for name in CUDA_PROTOTYPES}
     library = KernelLibrary(cast(Any, SimpleNamespace(**names)), "cuda", lambda device: 0)
-    with pytest.raises(OutOfMemoryError, match="on the GPU"):
+    with pytest.raises(OutOfMemoryError, match="on the GPU; .*--device cpu"):
         library.check(2)
 
 

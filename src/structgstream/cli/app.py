@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType, ModuleType
 
-from structgstream.errors import ConfigError, StructGStreamError
+from structgstream.errors import ConfigError, OutOfMemoryError, StructGStreamError
 
 COMMANDS = {
     "demo": "reconstruct, evaluate and export the bundled clip",
@@ -161,6 +161,8 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         where = "" if error.filename is None else f" of {error.filename}"
         return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
+    if type(error).__name__ == "OutOfMemoryError":  # torch's, which takes a second to import.
+        return str(OutOfMemoryError("on the GPU", on_gpu=True))
     if isinstance(error, MemoryError):
         detail = f" ({error})" if str(error) else ""
         return f"not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."

@@ -9,17 +9,21 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.cpu_losses import Comparison
-from structgstream.kernels.cuda_library import KernelLibrary, compiler_reason
+from structgstream.kernels.cuda_library import KernelLibrary, library_reason
 from structgstream.kernels.native import constant, members
 from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows, tile_grid
 
 
 def cuda_reason() -> str | None:
     """Why the back-end is not available on this machine and how to get it; None if it is."""
-    if not torch.cuda.is_available():
-        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
-        return f"torch {torch.__version__}, {built}, sees no NVIDIA GPU; install a driver and a CUDA build of torch."
-    return compiler_reason()
+    if torch.cuda.is_available():
+        return library_reason()
+    try:
+        torch.cuda.init()
+        cause = "it finds none"
+    except (RuntimeError, AssertionError) as error:  # An old driver, none, or a torch without CUDA.
+        cause = str(error).partition(". ")[0].rstrip(".")
+    return f"torch {torch.__version__} cannot use an NVIDIA GPU ({cause}); it needs a driver and a CUDA build of torch."
 
 
 class _L1SSIM(torch.autograd.Function):

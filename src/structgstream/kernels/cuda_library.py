@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""This package's CUDA kernels: compiles them once per GPU architecture, caches the library, and calls its functions.
+"""This package's CUDA kernels: carried by the wheel, or compiled once per GPU architecture; calls to them.
 
-The sources are installed with the package, because a wheel is rarely built on the machine that has the GPU.
+A wheel that was built where nvcc is carries compiled kernels (``STRUCTGSTREAM_CUDA`` in CMakeLists.txt). The sources
+are in every package, for GPUs and drivers that these do not fit.
 """
 
 import ctypes
@@ -27,6 +28,7 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
     "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
     "sgs_cuda_error": ("s", "i"),
+    "sgs_cuda_driver_fits": ("i", ""),
     "sgs_cuda_lift": ("i", "pp"),
     "sgs_cuda_views": ("i", "pip"),
     "sgs_cuda_reached_tiles": ("i", "pip"),
@@ -46,8 +48,8 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
 SHARED_HEADERS = ("include", "cpu")
 """Folders next to that of the sources, with the headers of the C interface of the CPU kernels."""
-NO_COMPILER = "nvcc was not found; install NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
-"""Why there are no kernels, where there is no compiler."""
+MIN_CAPABILITY = (8, 0)
+"""Compute capability that a wheel's kernels need: the oldest of ``SGS_CUDA_ARCHITECTURES`` in CMakeLists.txt."""
 _NO_MEMORY = 2  # cudaErrorMemoryAllocation
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
@@ -85,7 +87,7 @@ class KernelLibrary:
             BackendError: CUDA reports another error.
         """
         if error == _NO_MEMORY:
-            raise OutOfMemoryError("on the GPU for the CUDA kernels")
+            raise OutOfMemoryError("on the GPU", on_gpu=True)
         if error:
             message = self.library.sgs_cuda_error(error).decode()
             raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")
@@ -173,24 +175,53 @@ def _output(command: list[str]) -> str:
     return result.stdout
 
 
-def compiler_reason() -> str | None:
-    """Why the kernels cannot be compiled on this machine and how to change that; None if they can."""
-    return NO_COMPILER if find_nvcc(os.environ) is None else None
+def packaged_path() -> Path:
+    """Where a wheel that was built with nvcc has the compiled kernels."""
+    return Path(str(files("structgstream") / "_native" / "libstructgstream_cuda.so"))
+
+
+def packaged_reason() -> str | None:
+    """Why the kernels that the package carries do not run on this machine's GPU; None if they do."""
+    path = packaged_path()
+    if not path.is_file():
+        return "This installation of structgstream carries no compiled CUDA kernels"
+    if (capability := torch.cuda.get_device_capability()) < MIN_CAPABILITY:
+        needed, found = (".".join(map(str, version)) for version in (MIN_CAPABILITY, capability))
+        return f"The compiled CUDA kernels need a GPU of compute capability {needed}, and this one has {found}"
+    try:
+        fits = _load(path).library.sgs_cuda_driver_fits()
+    except OSError as error:
+        return f"The compiled CUDA kernels do not load ({error})"
+    return None if fits else "The driver of the GPU is older than the compiled CUDA kernels need; update it"
+
+
+def library_reason() -> str | None:
+    """Why there are no kernels for this machine's GPU and how to change that; None if there are or can be compiled."""
+    reason = packaged_reason()
+    if reason is None or find_nvcc(os.environ) is not None:
+        return None
+    return f"{reason}. To compile them, install NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
 
 
 @cache
 def kernel_library() -> KernelLibrary:
-    """The kernels for this machine's GPU. The first call compiles.
+    """The kernels for this machine's GPU. The first call compiles them, where the package's own do not fit.
 
     Raises:
-        BackendError: there is no compiler, it fails, or the library does not load.
+        BackendError: there are no kernels and no compiler, it fails, or the library does not load.
     """
+    if packaged_reason() is None:
+        return _load(packaged_path())
     nvcc = find_nvcc(os.environ)
     if nvcc is None:
-        raise BackendError(NO_COMPILER)
+        raise BackendError(str(library_reason()))
     major, minor = torch.cuda.get_device_capability()
     path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
     try:
-        return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream)
+        return _load(path)
     except OSError as error:
         raise BackendError(f"The CUDA kernels do not load ({error}); take the cpu back-end, or report this.") from error
+
+
+def _load(path: Path) -> KernelLibrary:
+    return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream)
