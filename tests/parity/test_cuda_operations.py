@@ -5,9 +5,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+import torch
 
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.session.presets import COMPACT
 from structgstream.training.online.exposure import exposure_reference
@@ -25,6 +27,8 @@ pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_r
 MAX_OPERATIONS = {4: 1_190, 27: 1_340}
 """By number of views, of the frame below: what it takes now, with little room. Whoever needs fewer lowers them."""
 MAX_WAITS = 20
+MAX_OF_PICTURE = 82, 3
+"""Operations and waits of a picture of a scene with environment and free Gaussians, copied to the host as bytes."""
 MAX_OF_ITERATION = 132, 3
 """Operations and waits of one iteration that runs in torch: for the anchors in view, their Gaussians, and the pairs."""
 
@@ -80,6 +84,19 @@ def test_an_online_frame(
     counts = second_frame(emulation(0), monkeypatch, views=views, iterations=40)
     assert counts.operations.total() <= MAX_OPERATIONS[views], counts.operations.most_common(20)
     assert counts.waits.total() <= MAX_WAITS, counts.waits.most_common(10)
+
+
+def test_a_picture(emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch) -> None:
+    world = moving_world(3, movers=20, cameras=5)
+    camera = world.rig["cam00"]
+    with counted_gpu(emulation(0).library, monkeypatch, native=True) as (backend, counts):
+        with counts.paused():
+            scene = moved(replace(world.scene, environment=torch.full((9, 3), 0.1)), DEVICE)
+            render(scene, camera, backend)  # uploads the camera
+        picture = to_8bit_image(render(scene, camera, backend).image)
+    assert picture.any()
+    assert counts.operations.total() <= MAX_OF_PICTURE[0], counts.operations.most_common(20)
+    assert counts.waits.total() <= MAX_OF_PICTURE[1], counts.waits.most_common(10)
 
 
 def test_an_iteration_in_torch(emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch) -> None:

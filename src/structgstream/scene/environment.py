@@ -29,10 +29,10 @@ def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
 
     They are the same in the units of the capture and of the scene, because the similarity does not rotate.
     """
-    viewport = camera.viewport(torch.zeros(0, dtype=torch.float64, device=pixels.device))
+    to_world = torch.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]  # on the processor: a GPU's inverse is waited for
     y = torch.div(pixels, camera.width, rounding_mode="floor")
     centers = torch.stack([pixels - y * camera.width + 0.5, y + 0.5, torch.ones_like(y)], dim=1)
-    rays = centers @ (torch.linalg.inv(viewport.K).T @ viewport.viewmat[:3, :3]).to(centers)
+    rays = centers @ to_world.to(centers)
     return rays * rays.square().sum(1, keepdim=True).rsqrt()
 
 

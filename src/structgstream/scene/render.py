@@ -92,8 +92,11 @@ def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
     The colour correction is the mean one, the identity. The background is the scene's environment, if it has one.
     """
     with torch.no_grad():
-        rendering = draw(scene.gaussians(camera, backend), camera, backend)
-        if not isinstance(scene, Scene) or scene.environment is None:
+        if not isinstance(scene, Scene):
+            return draw(scene.gaussians(camera, backend), camera, backend)
+        (gaussians,) = scene.gaussians_of_views([camera], backend)  # a GPU generates them without being waited for
+        rendering = draw(gaussians, camera, backend)
+        if scene.environment is None:
             return rendering
         return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, scene.environment))
 
