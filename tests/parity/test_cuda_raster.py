@@ -178,8 +178,9 @@ def test_weights_are_gradients_of_colours(emulation: Emulation) -> None:
     given = splats_of(*(value.float() for value in gaussians()[:5]))
     maps = torch.rand(HEIGHT, WIDTH, 5, generator=torch.Generator().manual_seed(3))
     rasterize = partial(cuda_picture.rasterize, emulation(0))
-    weights = cuda_picture.blending_weights(emulation(0), given, camera(torch.float32), maps)
-    again = reference_raster.weights_by_gradient(rasterize, given, camera(torch.float32), maps)
+    view = camera(torch.float32)
+    (weights,) = cuda_picture.weigh_views(emulation(0), [given], [view], maps[None], slots=len(given.means))
+    again = reference_raster.weights_by_gradient(rasterize, given, view, maps)
     assert (weights - again).norm() <= 1e-6 * weights.norm()
 
 

@@ -10,6 +10,7 @@ these pictures, which also corrects errors of earlier frames.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -265,9 +266,7 @@ def residual_flow(
             lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, backend=backend),
         )
     evidence = flow_evidence([primitive_sums(of_view, folded) for of_view in found])
-    coverage = found[0][:, 3]
-    for of_view in found[1:]:
-        coverage = coverage + of_view[:, 3]
+    coverage = reduce(torch.add, [of_view[:, 3] for of_view in found])
     return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, backend=backend)
 
 
