@@ -21,6 +21,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import TileSelection
+from structgstream.scene.render import as_picture
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
@@ -36,7 +37,7 @@ from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.online.select import inlier_views, occluded_dynamic
 from structgstream.training.online.split import with_displacements
 from structgstream.training.residuals import apply_camera_color
-from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
+from structgstream.training.views import View, area_mean, blackened, training_views
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
