@@ -90,7 +90,7 @@ class StartingPoint:
     displacements: Tensor
     split: DynamicSplit | None = None
     active_tiles: Mapping[int, ActiveTiles] | None = None
-    new_free: FreeGaussians | None = None
+    new_free: FreeGaussians = field(default_factory=FreeGaussians.empty)
     reference: Scene | None = None
 
     @property
@@ -101,11 +101,8 @@ class StartingPoint:
     @property
     def seen(self) -> list[View]:
         """The views in which the scene is visible."""
-        return (
-            self.views
-            if self.active_tiles is None
-            else [view for view in self.views if view.index in self.active_tiles]
-        )
+        active = self.active_tiles
+        return self.views if active is None else [view for view in self.views if view.index in active]
 
 
 @dataclass
@@ -204,10 +201,10 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     def patch(self, sample: View) -> bool:
         """Prunes and spawns free Gaussians; whether any came or went."""
         with self.watch.stage("patch"), torch.no_grad():
-            version, survivors = self.free_set.version, self.free_set.patch(sample)
-            if self.rate_term is not None and self.free_set.version != version:
+            survivors = self.free_set.patch(sample)
+            if self.rate_term is not None and survivors is not None:
                 self.rate_term = self.rate_term.after_pruning(survivors)
-        return self.free_set.version != version
+        return survivors is not None
 
     def counts(self) -> tuple[int, int]:
         split = self.start.split

@@ -16,6 +16,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import PatchingConfig
+from structgstream.training.online.measure import slot_count
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, values_of_rows
 from structgstream.training.views import View
@@ -61,8 +62,7 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
     Ids that no view draws (opacity 0) are left out.
     """
     found: list[Gaussians] = [_empty_like(scene)]
-    slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-    missing = torch.zeros(slots, dtype=torch.bool, device=ids.device)
+    missing = torch.zeros(slot_count(scene), dtype=torch.bool, device=ids.device)
     missing[ids] = True
     for view in views:
         if not missing.any():
@@ -127,7 +127,6 @@ class FreeSet:
         generator: of random numbers.
         spawned: number of spawned ones so far.
         pruned: number of pruned ones so far.
-        version: how often rows came or went; between, the tensors stay where they are.
     """
 
     config: PatchingConfig
@@ -142,13 +141,12 @@ class FreeSet:
     generator: torch.Generator
     spawned: int = 0
     pruned: int = 0
-    version: int = 0
 
     def __len__(self) -> int:
         return len(self.parameters.births)
 
-    def patch(self, view: View) -> Tensor:
-        """Prunes and spawns; returns the mask of the survivors.
+    def patch(self, view: View) -> Tensor | None:
+        """Prunes and spawns; returns the mask of the survivors, or None if none came or went.
 
         A child copies its parent's appearance in ``view``, if that draws it, else in the first other view that does.
         """
@@ -164,8 +162,7 @@ class FreeSet:
             generator=self.generator,
         )
         if keep.all() and not len(children):
-            return keep
-        self.version += 1
+            return None
         self.parameters.births = torch.cat([self.parameters.births[keep], children.births])
         self.adam.replace_rows(values_of_rows(children, FREE_ROWS), keep=keep)
         self.spawned, self.pruned = self.spawned + len(children), self.pruned + int((~keep).sum())
