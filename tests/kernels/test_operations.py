@@ -5,16 +5,12 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels import cuda, cuda_library, self_check
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, reference_backend
-from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
 from tests.support.rigs import arc_rig, random_scene
@@ -34,15 +30,6 @@ def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
     backend.lifted(opacities)  # pyright: ignore[reportAttributeAccessIssue]
     total: Tensor = backend.volume(opacities, opacities)  # pyright: ignore[reportAssignmentType]
     del total
-
-
-@pytest.fixture
-def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
-    library = KernelLibrary(functions, "cuda", lambda device: 0)
-    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: library)
-    monkeypatch.setattr(self_check, "disagreement", lambda rasterize, oracle, device: None)
 
 
 @pytest.mark.usefixtures("pretended_gpu")
