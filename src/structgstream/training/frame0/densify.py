@@ -125,12 +125,12 @@ class FreshCells(NamedTuple):
 
     Args:
         fresh: mask ``[P]`` of the points in such cells.
-        index: ``[p]``, the cell of each of these.
+        cell_of: ``[p]``, the cell of each of these.
         cells: ``[C, 3]`` int64, in units of a cell's side.
     """
 
     fresh: Tensor
-    index: Tensor
+    cell_of: Tensor
     cells: Tensor
 
 
