@@ -22,14 +22,13 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.anchors import AnchorCloud
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest
 from structgstream.training.online.config import OnlineConfig, SpawnRules
 from structgstream.training.online.exposure import ExposureReference, with_exposure_of
 from structgstream.training.online.measure import measure, primitive_sums, slot_count
 from structgstream.training.online.optimize import FrameOptimizer, StartingPoint
-from structgstream.training.online.patching import IDS_PER_FRAME
+from structgstream.training.online.patching import next_identity
 from structgstream.training.online.preprocess import PictureChange, flow_views
 from structgstream.training.online.scene_flow import residual_flow
 from structgstream.training.online.select import select_dynamic
@@ -232,7 +231,7 @@ class _Rounds:
                 displaced,
                 inliers,
                 active_tiles,
-                first_identity=self._first_identity(current.free),
+                first_identity=next_identity(current.free.births, fit.frame_index),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
                 config=config.spawn,
@@ -296,11 +295,6 @@ class _Rounds:
             backend=fit.backend,
         )
         return split.displaced(found.displacements), int(found.lifted.sum())
-
-    def _first_identity(self, free: FreeGaussians) -> int:
-        """The first identity of the frame that no earlier round has used."""
-        first = self.fit.frame_index * IDS_PER_FRAME
-        return max(first, int(free.births.max()) + 1) if len(free) else first
 
 
 def _together(results: list[FitResult[Scene]]) -> FitResult[Scene]:

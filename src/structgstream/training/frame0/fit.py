@@ -140,8 +140,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     parameters: Parameters
     adam: Adam[ParameterName]
     densifier: Densifier
-    views: list[View]
-    extent: float
     generator: torch.Generator
     numbers: RandomNumbers
     watch: Stopwatch
@@ -304,8 +302,6 @@ def _fit(
         parameters,
         adam,
         densifier,
-        views,
-        extent,
         generator,
         numbers,
         watch,

@@ -98,16 +98,14 @@ def spawn_children(
         z = torch.randn(count, 3, generator=generator).to(parents.means)
         local = (config.COVARIANCE_FACTOR**0.5) * parents.scales * z
         means = parents.means + (quaternion_matrices(parents.quats) @ local[:, :, None])[:, :, 0]
-    unit = parents.means.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.tensor(config.OPACITY)
-    return FreeGaussians(
-        means=means,
-        log_scales=parents.scales.clamp(min=1e-9).log(),
-        quats=unit.expand(count, 4).clone(),
-        logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
-        colors=parents.colors.clone(),
-        births=first_identity + torch.arange(count, device=parents.means.device),
-    )
+    log_scales, colors = parents.scales.clamp(min=1e-9).log(), parents.colors.clone()
+    return FreeGaussians.spawned(means, log_scales, colors, opacity=config.OPACITY, first_identity=first_identity)
+
+
+def next_identity(births: Tensor, frame_index: int) -> int:
+    """The first identity of a frame that is beyond all ``births``, of which some may be of this frame already."""
+    first = frame_index * IDS_PER_FRAME
+    return max(first, int(births.max()) + 1) if len(births) else first
 
 
 @dataclass
@@ -157,7 +155,7 @@ class FreeSet:
         children = spawn_children(
             parents,
             current.anchors.positions,
-            first_identity=self._next_identity(),
+            first_identity=next_identity(self.parameters.births, self.frame_index),
             config=self.config,
             generator=self.generator,
         )
@@ -179,9 +177,3 @@ class FreeSet:
             config=self.config,
             generator=self.generator,
         )
-
-    def _next_identity(self) -> int:
-        first = self.frame_index * IDS_PER_FRAME
-        births = self.parameters.births
-        # Some may have been spawned in this frame already.
-        return max(first, int(births.max()) + 1) if len(births) else first

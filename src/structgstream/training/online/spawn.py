@@ -167,16 +167,13 @@ def _merge_points(
     count = len(chosen)
     centers, looks, sizes = means[chosen].split([3, 3, 1], dim=1)
     sizes = sizes * (voxel / spacing)
-    unit = points.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.logit(torch.tensor(rules.opacity)).to(points)
     return Spawned(
-        FreeGaussians(
-            means=centers.contiguous(),
-            log_scales=(rules.size * sizes).log().expand(count, 3).contiguous(),
-            quats=unit.expand(count, 4).clone(),
-            logit_opacities=opacity.expand(count).clone(),
-            colors=looks.contiguous(),
-            births=first_identity + torch.arange(count, device=points.device),
+        FreeGaussians.spawned(
+            centers.contiguous(),
+            (rules.size * sizes).log().repeat(1, 3),
+            looks.contiguous(),
+            opacity=rules.opacity,
+            first_identity=first_identity,
         ),
         refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
         merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
