@@ -75,7 +75,8 @@ def test_masked_pixels_have_no_influence_on_loss_and_gradient(learned: bool, foc
     colors = gaussians.colors.detach().requires_grad_()
     tiles = TileSelection(torch.arange(24).reshape(4, 6) % 3 > 0, 96, 64)
     drawn = draw(gaussians, camera, backend).image.detach()
-    active = ActiveTiles(tiles, drawn.clone(), gaussians.select(torch.zeros(len(gaussians), dtype=torch.bool)))
+    none = gaussians.select(torch.zeros(len(gaussians), dtype=torch.bool))
+    active = ActiveTiles(tiles, drawn.clone(), none, changed=tiles)
     loss = picture_loss(
         replace(gaussians, colors=colors),
         View(0, camera, truth, mask),

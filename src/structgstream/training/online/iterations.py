@@ -170,14 +170,9 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         """The tiles of the view that the scene reaches; None for whole pictures."""
         return None if self.start.active_tiles is None else self.start.active_tiles[sample.index]
 
-    def _alternates(self, sample: View) -> bool:
-        """Whether some visits of the view are without the tiles in which nothing has changed."""
-        active = self.active_tiles_of(sample)
-        return active is not None and active.changed is not None and self.rest_every > 1
-
     def _rests(self, sample: View) -> bool:
         """Whether this visit of the view is without the tiles in which nothing has changed."""
-        return self._alternates(sample) and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
+        return self.start.active_tiles is not None and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
 
     def _tracks_screen(self, iteration: int) -> bool:
         patching = self.free_set.config
@@ -316,7 +311,7 @@ def _view(view: View, hooks: OnlineHooks) -> FitView:
         picture=view.image,
         mask=view.mask,
         tiles=active.tiles,
-        changed=active.tiles if active.changed is None else active.changed,
+        changed=active.changed,
         gains=scene.camera_color.gains[view.index],
         biases=scene.camera_color.biases[view.index],
         background=active.background,

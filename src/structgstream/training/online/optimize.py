@@ -133,8 +133,7 @@ class FrameOptimizer:
         patching = self.config.patching
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
         splits = None not in (start.active_tiles, start.split)
-        fits = splits and not tracks_screen and not unknown_natively(self.config, start.scene)
-        return self.backend.iterations is not None and fits
+        return splits and not tracks_screen and not unknown_natively(self.config, start.scene)
 
     def _patch_at(self, start: StartingPoint) -> int:
         return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
