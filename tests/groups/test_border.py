@@ -10,19 +10,19 @@ from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
 from structgstream.groups.seam_blend import draw_border, moving_at_border
 from structgstream.scene.scene import Scene
+from structgstream.training.online.measure import primitive_sums, slot_count
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import made
 
 
 def most_seen(scene: Scene, rig: CameraRig) -> int:
     """The anchor that covers most of the pictures."""
-    backend, covered = quickest_backend(), torch.zeros(len(scene.anchors), 1)
-    for name in rig.training:
-        camera, gaussians = rig[name], scene.gaussians(rig[name], backend)
-        maps = torch.ones(camera.height, camera.width, 1)
-        sums = backend.blending_weights(gaussians, camera.viewport(gaussians.means), maps)
-        covered.index_add_(0, gaussians.ids // scene.anchors.offsets_per_anchor, sums)
-    return int(covered.argmax())
+    backend, cameras = quickest_backend(), [rig[name] for name in rig.training]
+    viewports = [camera.viewport(scene.anchors.positions) for camera in cameras]
+    maps = torch.ones(len(cameras), cameras[0].height, cameras[0].width, 1)
+    gaussians = scene.gaussians_of_views(cameras, backend)
+    sums = backend.weigh_views(gaussians, viewports, maps, slots=slot_count(scene))
+    return int(primitive_sums(sums.sum(0), scene)[: len(scene.anchors)].argmax())
 
 
 def moving(before: Scene, first: Scene, rig: CameraRig, **around: Scene) -> Tensor | None:

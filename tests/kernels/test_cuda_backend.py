@@ -1,29 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the cuda back-end is made of, on a machine that only says it has a GPU."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 import torch
 
 from structgstream.errors import BackendError
-from structgstream.kernels import backend, cuda, cuda_library, reference_losses, reference_motion, self_check
-from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
+from structgstream.kernels import backend, cuda_library, reference_losses, reference_motion, self_check
 
 
-def test_own_operations_are_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
-    library = KernelLibrary(functions, "cuda", lambda device: 0)
-    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: library)
-    monkeypatch.setattr(self_check, "disagreement", lambda rasterize, oracle, device: None)
+@pytest.mark.usefixtures("pretended_gpu")
+def test_own_operations_are_the_kernels() -> None:
     found, reference, processor = backend.cuda_backend(), backend.reference_backend(), backend.processor_backend()
     assert (found.name, found.device) == ("cuda", torch.device("cuda"))
     assert found.iterations is not None
     own = {name for name, function in found.functions.items() if function is not reference.functions[name]}
     assert own == {
-        *("rasterize", "blending_weights", "generate_structured", "generate_views", "draw_views", "weigh_views"),
+        *("rasterize", "generate_structured", "generate_views", "draw_views", "weigh_views"),
         *("draw_and_weigh_views", "reached_tiles", "l1_ssim", "sweep", "lift", "adam_step"),
         *(name for name in ("confident_flow", "plane_scores") if processor.name == "cpu"),
     }
@@ -31,10 +23,8 @@ def test_own_operations_are_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None
     assert found.changed_pixels is reference_motion.changed_pixels
 
 
+@pytest.mark.usefixtures("pretended_gpu")
 def test_a_gpu_that_draws_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: KernelLibrary(functions, "cuda", lambda device: 0))
     monkeypatch.setattr(self_check, "disagreement", lambda rasterize, oracle, device: "the pictures by 0.5")
     with pytest.raises(BackendError, match=r"otherwise than the processor: the pictures by 0\.5\. Use --device cpu"):
         backend.cuda_backend()

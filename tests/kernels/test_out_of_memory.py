@@ -4,7 +4,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from structgstream.codec.entropy import decisions, rans
 from structgstream.codec.entropy.decisions import ArithmeticState
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
-from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Anchors, Neighbors, ViewFlows
 from tests.support.splats import splats_of, viewport_of
@@ -123,11 +122,9 @@ def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
         call()
 
 
-def test_no_memory_on_the_gpu() -> None:
-    names = {name: SimpleNamespace() for name in CUDA_PROTOTYPES}
-    library = KernelLibrary(cast(Any, SimpleNamespace(**names)), "cuda", lambda device: 0)
+def test_no_memory_on_the_gpu(pretended_gpu: KernelLibrary) -> None:
     with pytest.raises(OutOfMemoryError, match="on the GPU; .*--device cpu"):
-        library.check(2)
+        pretended_gpu.check(2)
 
 
 def test_no_memory_for_gradients() -> None:

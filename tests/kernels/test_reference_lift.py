@@ -26,6 +26,13 @@ def centers() -> torch.Tensor:
     return 0.2 * torch.randn(MOVERS, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
+def projected(points: torch.Tensor) -> torch.Tensor:
+    viewmats, Ks, _ = cameras()
+    seen = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    pixels = torch.einsum("vij,vej->vei", Ks, seen)
+    return pixels[..., :2] / pixels[..., 2:]
+
+
 def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torch.Tensor | None = None):
     viewmats, Ks, near = cameras()
     return lift(
@@ -40,12 +47,6 @@ def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torc
 def test_the_jacobian_is_that_of_the_projection() -> None:
     viewmats, Ks, near = cameras()
     points = centers()[:4]
-
-    def projected(x: torch.Tensor) -> torch.Tensor:
-        seen = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], x) + viewmats[:, None, :3, 3]
-        pixels = torch.einsum("vij,vej->vei", Ks, seen)
-        return pixels[..., :2] / pixels[..., 2:]
-
     step = 1e-6
     found = projection_jacobians(points, viewmats, Ks, near)
     for axis in range(3):
@@ -84,12 +85,6 @@ def test_a_turning_ball_that_moves_by_40_pixels_is_lifted_whole(monkeypatch) -> 
     turn = torch.linalg.matrix_exp(0.25 * torch.tensor([[0, -1, 0.5], [1, 0, 0.3], [-0.5, -0.3, 0]]).double())
     by = torch.tensor([0.22, -0.14, 0.10], dtype=torch.float64)
     now = ball @ turn.T + by
-
-    def projected(x: torch.Tensor) -> torch.Tensor:
-        seen = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], x) + viewmats[:, None, :3, 3]
-        pixels = torch.einsum("vij,vej->vei", Ks, seen)
-        return pixels[..., :2] / pixels[..., 2:]
-
     flows = projected(now) - projected(ball)
     assert flows.norm(dim=-1).mean() > 30.0
     distances = torch.cdist(ball, ball)

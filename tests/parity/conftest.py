@@ -5,12 +5,13 @@ import ctypes
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import ISA_NAMES, native_library
+from structgstream.kernels.native import ISA_NAMES, native_library, native_reason
 from tests.support.shared_folder import made_once
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
@@ -19,12 +20,23 @@ SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 @pytest.fixture(params=range(len(ISA_NAMES)), ids=ISA_NAMES)
 def isa(request: pytest.FixtureRequest) -> Iterator[int]:
     """One run of the test for each instruction set."""
+    with using_isa(request.param):
+        yield request.param
+
+
+@contextmanager
+def using_isa(isa: int) -> Iterator[None]:
+    """The kernels for an instruction set within; the test is skipped where it is missing."""
+    if native_reason() is not None:
+        pytest.skip(str(native_reason()))
     library = native_library()
-    if request.param > library.sgs_best_isa():
-        pytest.skip(f"this processor or build has no {ISA_NAMES[request.param]}")
-    library.sgs_use_isa(request.param)
-    yield request.param
-    library.sgs_use_isa(len(ISA_NAMES))
+    if isa > library.sgs_best_isa():
+        pytest.skip(f"this processor or build has no {ISA_NAMES[isa]}")
+    library.sgs_use_isa(isa)
+    try:
+        yield
+    finally:
+        library.sgs_use_isa(len(ISA_NAMES))
 
 
 @pytest.fixture(scope="session")

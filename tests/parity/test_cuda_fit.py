@@ -74,7 +74,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(emulation: Emulation, optio
         for mine, theirs in zip(one.leaves, two.leaves, strict=True):
             if mine is not None and theirs is not None and mine.first is not None and theirs.first is not None:
                 assert (mine.first - theirs.first).norm() <= 1e-3 * mine.first.norm()
-    assert len(seen) == 5
+    assert len(seen) == 6
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 processor, with threads and blocks in both orders, and on a GPU where there is one.
 """
 
-import resource
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -26,6 +25,8 @@ from tests.parity.test_raster import (
     WIDTH,
     camera,
     check_against_reference,
+    check_nothing_broken_or_hidden_is_drawn,
+    check_that_memory_is_freed_without_a_backward_pass,
     gaussians,
     intervals_at,
     run,
@@ -133,33 +134,13 @@ def test_only_the_picture_or_only_coverage_has_a_gradient(emulation: Emulation, 
     assert found[0][0].any()
 
 
-def test_nothing_to_draw_and_what_is_broken_or_hidden(emulation: Emulation) -> None:
-    empty = [value[:0].float() for value in gaussians()]
-    image, alpha, radii, *gradients = in_both_orders(emulation, empty, background=COLOURED)
-    assert torch.equal(image, COLOURED.expand(HEIGHT, WIDTH, 3))
-    assert not alpha.any()
-    assert [len(value) for value in (radii, *gradients)] == [0] * 7
-    inputs = [value[:7].float().clone() for value in gaussians()]
-    inputs[0][0] = torch.nan
-    inputs[0][1] = torch.tensor([0.0, 0.0, -5.0])
-    inputs[1][2] = torch.inf
-    inputs[2][3] = torch.tensor([1e9, 1e9, 1e9])
-    inputs[4][4, 1] = torch.nan
-    image, _, radii, *gradients = in_both_orders(emulation, inputs)
-    assert radii[:5].tolist() == [0.0] * 5
-    assert torch.isfinite(image).all()
-    assert all(torch.isfinite(gradient).all() and not gradient[:5].any() for gradient in gradients)
+@pytest.mark.parametrize("order", [0, 1])
+def test_nothing_broken_or_hidden_is_drawn(emulation: Emulation, order: int) -> None:
+    check_nothing_broken_or_hidden_is_drawn(partial(cuda_picture.rasterize, emulation(order)))
 
 
-def test_what_gradients_need_is_freed_without_a_backward_pass(emulation: Emulation) -> None:
-    inputs = [value.float().requires_grad_() for value in gaussians(3000)[:5]]
-    view = camera(torch.float32)._replace(width=320, height=240)
-    peaks = []
-    for _ in range(3):
-        for _ in range(40):
-            cuda_picture.rasterize(emulation(0), splats_of(*inputs), view)
-        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    assert peaks[2] - peaks[0] < 20_000  # kB; 80 pictures that leaked would hold more than 40,000
+def test_memory_is_freed_without_a_backward_pass(emulation: Emulation) -> None:
+    check_that_memory_is_freed_without_a_backward_pass(partial(cuda_picture.rasterize, emulation(0)))
 
 
 def test_another_precision_is_refused_and_a_changed_input_is_found(emulation: Emulation) -> None:
@@ -178,8 +159,9 @@ def test_weights_are_gradients_of_colours(emulation: Emulation) -> None:
     given = splats_of(*(value.float() for value in gaussians()[:5]))
     maps = torch.rand(HEIGHT, WIDTH, 5, generator=torch.Generator().manual_seed(3))
     rasterize = partial(cuda_picture.rasterize, emulation(0))
-    weights = cuda_picture.blending_weights(emulation(0), given, camera(torch.float32), maps)
-    again = reference_raster.weights_by_gradient(rasterize, given, camera(torch.float32), maps)
+    view = camera(torch.float32)
+    (weights,) = cuda_picture.weigh_views(emulation(0), [given], [view], maps[None], slots=len(given.means))
+    again = reference_raster.weights_by_gradient(rasterize, given, view, maps)
     assert (weights - again).norm() <= 1e-6 * weights.norm()
 
 

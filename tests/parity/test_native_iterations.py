@@ -83,7 +83,7 @@ def start_of(scene: Scene) -> StartingPoint:
             tiles,
             torch.full(view.image.shape, 0.3),
             split.static.without_free().gaussians(view.camera, backend),
-            None if view is views[2] else tiles_of(views, first=1, last=3),
+            tiles_of(views, first=1, last=3),
             torch.tensor([0.1, 0.2, 0.3]) if view is views[0] else None,
         )
         for view in views[:3]

@@ -10,9 +10,3 @@ def test_the_gauge_is_exact_and_keeps_differences() -> None:
     assert torch.allclose(gauged.gains.mean(0), torch.ones(3))
     assert torch.allclose(gauged.biases.mean(0), torch.zeros(3), atol=1e-6)
     assert torch.allclose(gauged.gains[1] - gauged.gains[0], color.gains[1] - color.gains[0])
-
-
-def test_identity_changes_nothing() -> None:
-    color = CameraColor.identity(2)
-    assert torch.equal(color.gains, torch.ones(2, 3))
-    assert not color.biases.any()

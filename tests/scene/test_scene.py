@@ -45,7 +45,3 @@ def test_without_the_distance_input_the_distance_does_not_matter() -> None:
     )
     camera = arc_rig()["cam01"]
     assert len(narrow.gaussians(camera, reference_backend())) > 0
-
-
-def test_without_free() -> None:
-    assert len(random_scene(free=4).without_free().free) == 0

@@ -6,10 +6,10 @@ import torch
 
 from structgstream.gaussians import Gaussians
 from structgstream.training.frame0.regularizers import (
-    Perturbation,
     PerturbationConfig,
     RandomNumbers,
     perturbation_at,
+    perturbed,
 )
 from tests.support.varied import varied
 
@@ -50,13 +50,9 @@ def test_more_random_numbers_than_a_table_holds() -> None:
     assert many.std().item() == pytest.approx(1.0, abs=0.02)
 
 
-def perturbed(config: PerturbationConfig, *, strength: float = 1.0, seed: int = 0) -> Gaussians:
-    return Perturbation(config, numbers(seed), strength=strength)(gaussians())
-
-
 @pytest.mark.parametrize("strength", [1.0, 0.5])
 def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
-    found = perturbed(PerturbationConfig(dropped_share=0.4), strength=strength)
+    found = perturbed(gaussians(), PerturbationConfig(dropped_share=0.4), numbers(), strength=strength)
     gone = found.opacities == 0
     assert gone.float().mean().item() == pytest.approx(0.4 * strength, abs=0.01)
     assert found.opacities.mean().item() == pytest.approx(0.3, abs=0.01)
@@ -66,15 +62,13 @@ def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
 
 
 def test_opacities_stay_below_one() -> None:
-    whole = gaussians()
-    config = PerturbationConfig(dropped_share=0.9)
-    found = Perturbation(config, numbers(), strength=1.0)(whole)
+    found = perturbed(gaussians(), PerturbationConfig(dropped_share=0.9), numbers(), strength=1.0)
     assert found.opacities.max() < 1.0
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.5])
 def test_means_are_shifted_by_their_extent(strength: float) -> None:
-    found = perturbed(PerturbationConfig(noise_scales=0.2), strength=strength)
+    found = perturbed(gaussians(), PerturbationConfig(noise_scales=0.2), numbers(), strength=strength)
     shift = found.means - 1.0
     assert shift.mean().item() == pytest.approx(0.0, abs=0.01)
     assert shift.std().item() == pytest.approx(0.2 * strength * 0.5, rel=0.05)
@@ -84,7 +78,7 @@ def test_means_are_shifted_by_their_extent(strength: float) -> None:
 
 def test_the_seed_decides() -> None:
     config = PerturbationConfig(dropped_share=0.2, noise_scales=0.2)
-    one, same, other = (perturbed(config, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (perturbed(gaussians(), config, numbers(seed), strength=1.0) for seed in (1, 1, 2))
     assert torch.equal(one.means, same.means)
     assert torch.equal(one.opacities, same.opacities)
     assert not torch.equal(one.means, other.means)

@@ -7,11 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.errors import ConfigError
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
-from structgstream.session.presets import COMPACT
-from structgstream.training.online.config import ExposureConfig, OnlineConfig
+from structgstream.training.online.config import ExposureConfig
 from structgstream.training.online.exposure import exposure_reference, with_exposure_of
 from structgstream.training.views import View, training_views
 from tests.support.varied import varied
@@ -132,12 +130,3 @@ def test_masked_pixels_say_nothing() -> None:
     masked = [View(v.index, v.camera, torch.where(half[..., None], v.image, 0), half) for v in views]
     found = followed(WORLD.scene, masked)
     assert change_of(found, WORLD.scene).numpy() == pytest.approx(wanted, abs=0.02)
-
-
-def test_light_needs_the_color_mlp_in_packets() -> None:
-    with pytest.raises(ConfigError, match="color_mlp"):
-        OnlineConfig(exposure=ExposureConfig(enabled=True))
-    online = COMPACT.online
-    assert online.exposure.enabled
-    assert "color_mlp" not in online.trained
-    assert replace(online, exposure=ExposureConfig()).trained == online.dynamic

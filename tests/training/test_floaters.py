@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -129,8 +129,3 @@ def test_pixels_that_do_not_count_judge_nothing() -> None:
 
 def test_smaller_pictures_tell_the_same() -> None:
     assert found(wall_and(FLOATING, opacity=-0.5), config=varied(CONFIG, SCALE=0.5)) == [True, True]
-
-
-def test_back_ends_agree() -> None:
-    scene = wall_and(FLOATING, opacity=-0.5)
-    assert found(scene, backend=reference_backend()) == found(scene)

@@ -104,19 +104,19 @@ def thrown(width: int, *, by: float = 60 / 320, body: bool = False) -> tuple[Flo
 def test_a_ball_that_crosses_a_share_of_the_width_is_found_at_every_size(width: int) -> None:
     by = 0.14
     found, ball = thrown(width, by=by)
-    assert found.far_boxes == 1, "the old and the new place are searched together"
+    assert found.counts["far boxes"] == 1, "the old and the new place are searched together"
     confidence, flow = found.maps[ball][:, 0], found.maps[ball][:, 1:]
     assert confidence.mean() > 0.7
     expected = torch.tensor([round(by * width), 0.0])
     right = (flow - expected).norm(dim=1) < 0.01 * width
     assert right[confidence > 0].float().mean() > 0.95
-    assert found.far_pixels > 0.9 * int((confidence > 0).sum())
+    assert found.counts["far pixels"] > 0.9 * int((confidence > 0).sum())
 
 
 @WIDTHS
 def test_a_ball_is_found_next_to_a_body_whose_flow_is_consistent(width: int) -> None:
     found, ball = thrown(width, by=0.14, body=True)
-    assert found.far_boxes == 1
+    assert found.counts["far boxes"] == 1
     expected = torch.tensor([round(0.14 * width), 0.0])
     confidence, flow = found.maps[ball][:, 0], found.maps[ball][:, 1:]
     assert (confidence * ((flow - expected).norm(dim=1) < 0.01 * width)).mean() > 0.6
@@ -124,7 +124,7 @@ def test_a_ball_is_found_next_to_a_body_whose_flow_is_consistent(width: int) -> 
 
 @WIDTHS
 def test_what_does_not_move_far_is_searched_once(width: int) -> None:
-    assert thrown(width, by=0.01)[0].far_boxes == 0
+    assert thrown(width, by=0.01)[0].counts["far boxes"] == 0
 
 
 def test_where_there_is_nothing_to_find_no_far_flow_is_found() -> None:
@@ -135,7 +135,7 @@ def test_where_there_is_nothing_to_find_no_far_flow_is_found() -> None:
     pictures = torch.from_numpy(first), torch.from_numpy(second)
     changed = quickest_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
     found = flow_map(*pictures, changed, (480, 640), backend=quickest_backend())
-    assert found.far_boxes == 1
+    assert found.counts["far boxes"] == 1
     far = found.maps[..., 1:].norm(dim=-1) > 8.0
     assert (far & changed).sum() < 0.02 * changed.sum()
     assert not (far & ~changed).any()

@@ -37,7 +37,7 @@ def ones(parameters: Parameters) -> dict[ParameterName, torch.Tensor]:
     return {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
 
 
-def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[FreeSet, torch.Tensor]:
+def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[FreeSet, torch.Tensor | None]:
     parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
     adam = Adam(BACKEND, parameters.values)
     adam.step(ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
@@ -65,6 +65,7 @@ def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[FreeSet, torch.Ten
 def test_the_faint_die_and_children_follow_those_that_stay() -> None:
     population, keep = patch(room=10)
     parameters = population.parameters
+    assert keep is not None
     assert keep.tolist() == [True, False, True]
     assert (population.spawned, population.pruned) == (2, 1)
     assert parameters.births.tolist() == [4, 6, 7 * IDS_PER_FRAME, 7 * IDS_PER_FRAME + 1]
@@ -76,8 +77,8 @@ def test_the_faint_die_and_children_follow_those_that_stay() -> None:
 
 
 def test_who_dies_has_no_children() -> None:
-    population, keep = patch(room=10, dying_gradient=3.0)
-    assert keep.tolist() == [True, False, True]
+    population, _ = patch(room=10, dying_gradient=3.0)
+    assert population.pruned == 1
     assert population.spawned == 2
     assert len(population) == 4
 
@@ -86,15 +87,14 @@ def test_no_more_are_spawned_than_there_is_room_for_and_the_largest_gradient_com
     assert len(patch(room=10)[0]) == 4
     population, keep = patch(room=3)
     assert population.spawned == 1
+    assert keep is not None
     assert len(population) == int(keep.sum()) + 1 == 3
     assert patch(room=2)[0].spawned == 0
 
 
 def test_rows_stay_where_they_are_if_none_comes_or_goes() -> None:
     population, _ = patch(room=10)
-    assert population.version == 1
     population.config = replace(population.config, spawn="off")
     before = dict(population.parameters.values)
-    assert population.patch(population.views[0]).all()
-    assert population.version == 1
+    assert population.patch(population.views[0]) is None
     assert all(population.parameters.values[name] is before[name] for name in FREE_ROWS)

@@ -114,12 +114,6 @@ def test_room_for_anchors_comes_little_by_little() -> None:
     assert replace(config, min_growth=0.25).room_at(500, 1_000) == 5_000
 
 
-def test_the_last_interval_is_left_to_what_grew_before_it() -> None:
-    assert GrowthConfig().last(4000) == 3900  # The paper ends while Scaffold-GS still grows.
-    assert GrowthConfig().last(30_000) == 15_000
-    assert GrowthConfig(stop=50, interval=20).last(60) == 40
-
-
 def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
     statistics = OpacityStatistics(3, torch.device("cpu"))
     none = Gaussians(*(torch.zeros(0),) * 6)

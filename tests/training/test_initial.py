@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.state import state_of
 from structgstream.training.frame0.densify import GrowthConfig
@@ -58,13 +57,6 @@ def test_coarse_seeds_lie_on_the_fine_grid() -> None:
     anchors = fit(world, config=config).scene.anchors
     assert len(anchors) == len(voxel_centers(world.scene.anchors.positions, 0.15)) < 60
     cells = anchors.positions / QUICK.voxel_size
-    assert torch.allclose(cells, cells.round(), atol=1e-3)
-
-
-def test_anchors_do_not_move_in_frame_0() -> None:
-    world = moving_world(1)
-    config = replace(QUICK, iterations=10)
-    cells = fit(world, config=config).scene.anchors.positions / QUICK.voxel_size
     assert torch.allclose(cells, cells.round(), atol=1e-3)
 
 
@@ -130,12 +122,6 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     config = replace(QUICK, iterations=25)
     one, two = (state_of(fit(world, config=config).scene) for _ in range(2))
     assert all(torch.equal(one[name], two[name]) for name in one)
-
-
-def test_too_few_points_are_refused() -> None:
-    world = moving_world(1)
-    with pytest.raises(CaptureError, match="at least 4"):
-        fit(world, points=torch.zeros(50, 3))
 
 
 def test_rates_of_the_reference_schedule() -> None:

@@ -7,16 +7,13 @@ import numpy as np
 import torch
 
 from structgstream.frames import MultiViewFrame
-from structgstream.gaussians import Gaussians, concatenate
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
-    accumulate,
     flow_evidence,
     measure,
     primitive_centers,
-    primitive_of,
+    primitive_sums,
     slot_count,
-    sum_by_primitive,
 )
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.views import training_views
@@ -30,51 +27,29 @@ BACKEND = quickest_backend()
 CPU = torch.device("cpu")
 
 
-def gaussians_with_ids(ids: list[int]) -> Gaussians:
-    n = len(ids)
-    zeros = torch.zeros(n, 3)
-    return Gaussians(zeros, torch.zeros(n, 4), zeros, torch.zeros(n), zeros, torch.tensor(ids))
-
-
 def test_movers_are_anchors_then_free_gaussians() -> None:
     scene = random_scene(4, free=2)
     k = scene.anchors.offsets_per_anchor
     assert slot_count(scene) == 4 * k + 2
-    drawn = gaussians_with_ids([*range(4 * k), 4 * k, 4 * k + 1])
-    found = sum_by_primitive(drawn.ids[:, None].float(), primitive_of(drawn, scene), scene)[:, 0]
+    found = primitive_sums(torch.arange(4.0 * k + 2)[:, None], scene)[:, 0]
     assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
-
-
-def test_movers_that_are_not_drawn_get_nothing() -> None:
-    scene = random_scene(4, free=2)
-    k = scene.anchors.offsets_per_anchor
-    drawn = gaussians_with_ids([k, 2 * k - 1, 4 * k + 1])
-    found = sum_by_primitive(torch.tensor([[1.0], [2.0], [4.0]]), primitive_of(drawn, scene), scene)
-    assert found[:, 0].tolist() == [0.0, 3.0, 0.0, 0.0, 0.0, 4.0]
 
 
 def test_all_movers_may_be_free_gaussians() -> None:
     """A scene without anchors is what moves where only free Gaussians do."""
-    scene = random_scene(0, free=2)
-    drawn, sums = gaussians_with_ids([0, 1]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    assert sum_by_primitive(sums, primitive_of(drawn, scene), scene).tolist() == sums.tolist()
+    scene, sums = random_scene(0, free=2), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    assert primitive_sums(sums, scene).tolist() == sums.tolist()
     assert torch.equal(primitive_centers(scene, torch.ones(2)), scene.free.means)
 
 
 def test_weighed_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
     scene = random_scene(30, free=3)
-    gaussians = scene.gaussians(CAMERA, BACKEND)
-    maps = torch.ones(32, 48, 1)
-    alone = accumulate(gaussians, CAMERA, maps, BACKEND)
-    assert alone.shape == (len(gaussians), 1)
-    ball = emerging_ball(0.99)
-    before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
-    covered = accumulate(gaussians, CAMERA, maps, BACKEND, static=before)
-    assert covered.shape == alone.shape, "what hides is not reported"
+    views, slots = ([scene.gaussians(CAMERA, BACKEND)], [CAMERA.viewport(scene.free.means)]), slot_count(scene)
+    (alone,) = BACKEND.weigh_views(*views, torch.ones(1, 32, 48, 1), slots=slots)
+    before = replace(emerging_ball(0.99), means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
+    (covered,) = BACKEND.weigh_views(*views, torch.ones(1, 32, 48, 1), slots=slots, static=[before])
     assert float(covered.sum()) < 0.8 * float(alone.sum())
     assert (covered <= alone + 1e-4).all()
-    together = concatenate(gaussians, before)
-    assert len(together) == len(gaussians) + 1
 
 
 def test_evidence_is_a_mean_with_bounds() -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What happens around each iteration of a later frame."""
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -73,7 +73,7 @@ def selection(tiles: int) -> TileSelection:
     return TileSelection(mask, CAMERA.width, CAMERA.height)
 
 
-def focused(changed: TileSelection | None) -> StartingPoint:
+def focused(changed: TileSelection) -> StartingPoint:
     """A start of which the first two views show what moves, in three tiles."""
     still = WORLD.scene.gaussians(CAMERA, BACKEND).select(torch.zeros(0, dtype=torch.int64))
     active_tiles = {
@@ -119,17 +119,6 @@ def test_nothing_of_a_loss_keeps_its_graph_once_the_step_is_taken() -> None:
     assert len(tensors(loss.detached())) > 15
 
 
-def test_views_that_do_not_show_what_moves_are_not_seen() -> None:
-    assert started().seen == VIEWS
-    assert focused(None).seen == VIEWS[:2]
-
-
-def test_changes_are_counted_from_the_scene_unless_another_is_given() -> None:
-    reference = random_scene(60, cameras=4, seed=5)
-    assert started().known is WORLD.scene
-    assert started(reference=reference).known is reference
-
-
 def test_tiles_without_change_are_drawn_in_one_visit_of_three() -> None:
     hooks = hooks_of(focused(selection(1)), rest_every=3)
     drawn = pixels_drawn(hooks, view=0, visits=6)
@@ -139,8 +128,8 @@ def test_tiles_without_change_are_drawn_in_one_visit_of_three() -> None:
     assert hooks.visits == {VIEWS[0].index: 6, VIEWS[1].index: 1}
 
 
-def test_all_tiles_are_drawn_where_changes_are_not_known_or_every_visit_rests() -> None:
-    whole = pixels_drawn(hooks_of(focused(None), rest_every=3), view=0, visits=4)
+def test_all_tiles_are_drawn_where_all_changed_or_no_visit_rests() -> None:
+    whole = pixels_drawn(hooks_of(focused(selection(3)), rest_every=3), view=0, visits=4)
     assert len(set(whole)) == 1
     assert pixels_drawn(hooks_of(focused(selection(1)), rest_every=1), view=0, visits=4) == whole
 
@@ -181,10 +170,3 @@ def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
     worse = iterate(hooks, 2)
     assert worse.total > loss.total
     assert hooks.last_pass.psnr < 30.0
-
-
-def test_prices_are_added_to_the_loss() -> None:
-    plain = hooks_of(started())
-    priced = replace(plain, rate_term=cast(Any, SimpleNamespace(value=lambda values, backend: torch.tensor(0.5))))
-    loss, unpriced = priced.loss(1, VIEWS[0]), plain.loss(1, VIEWS[0]).total
-    torch.testing.assert_close(loss.total, unpriced + 0.5)

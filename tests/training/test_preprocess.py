@@ -45,16 +45,6 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
             assert shift.abs().max() > 0.5
 
 
-def test_equal_pictures_are_the_same() -> None:
-    backend = reference_backend()
-    frozen = replace(WORLD.frames[0], index=1)
-    before = training_views(WORLD.frames[0], WORLD.rig, backend.device)
-    found = preprocess(frozen, WORLD.rig, before=before, motion=MOTION, scene_flow=START, backend=backend)
-    changes = known(found)
-    assert all(change.repeated and not change.changed.any() for change in changes)
-    assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)
-
-
 def test_everything_may_move_without_a_frame_before_without_a_gate_and_in_full_frames() -> None:
     assert pictures(first=True).changes is None
     assert pictures(motion=replace(MOTION, enabled=False)).changes is None

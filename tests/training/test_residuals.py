@@ -13,8 +13,8 @@ from structgstream.training.residuals import (
     apply_camera_color,
     box_mean,
     recorded,
-    residual,
     residual_floor,
+    residuals,
 )
 from structgstream.training.views import blackened, training_views
 from tests.support.backends import quickest_backend
@@ -30,16 +30,6 @@ def views(t: int):
     return training_views(WORLD.frames[t], WORLD.rig, CPU)
 
 
-def test_a_mean_over_a_box_counts_pixels_that_exist() -> None:
-    values = torch.zeros(4, 5)
-    values[0, 0] = 9.0
-    found = box_mean(values, 3)
-    assert found[0, 0] == 9.0 / 4
-    assert found[1, 1] == 1.0
-    assert found[0, 1] == 9.0 / 6
-    assert not found[2:].any()
-
-
 @pytest.mark.parametrize(("size", "pixels"), [((9, 14), 3), ((9, 14), 5), ((2, 14), 7), ((1, 1), 5)])
 def test_a_mean_over_a_box_is_torchs(size: tuple[int, int], pixels: int) -> None:
     values = torch.rand(size, generator=torch.Generator().manual_seed(1))
@@ -52,8 +42,8 @@ def test_a_rendering_is_compared_as_its_camera_would_have_recorded_it() -> None:
     torch.testing.assert_close(apply_camera_color(torch.full((2, 2, 3), 0.3), color, 1), torch.full((2, 2, 3), 0.7))
     view = views(0)[1]
     drawn = (view.colors - 0.1) / 2.0
-    assert residual(drawn, view, color, BACKEND).max() < 1e-6
-    assert residual(view.colors, view, color, BACKEND).mean() > 0.05
+    assert residuals([drawn], [view], color, BACKEND).max() < 1e-6
+    assert residuals([view.colors], [view], color, BACKEND).mean() > 0.05
 
 
 def test_gradients_of_a_recorded_rendering_are_those_of_its_formula() -> None:
@@ -124,9 +114,10 @@ def test_masked_pixels_miss_nothing_and_their_floor_is_out_of_reach() -> None:
     spoiled = [replace(view, image=blackened(view.image, mask), mask=mask) for view in views(0)]
     picture = torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(0))
     color = WORLD.scene.camera_color
-    found = residual(picture, spoiled[0], color, BACKEND)
+    (found,) = residuals([picture], spoiled[:1], color, BACKEND)
     assert not found[~mask].any()
-    assert torch.equal(found, residual(torch.where(mask[..., None], picture, 0.5), spoiled[0], color, BACKEND))
+    elsewhere = torch.where(mask[..., None], picture, 0.5)
+    assert torch.equal(found, residuals([elsewhere], spoiled[:1], color, BACKEND)[0])
     floor = residual_floor(WORLD.scene, spoiled, scale=1.0, backend=BACKEND).maps
     assert (floor[0][~mask] == 1.0).all()
     clean = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND).maps

@@ -68,12 +68,6 @@ def test_one_more_of_quality_is_twice_as_fine_and_a_quarter_as_dear(quality: flo
     assert other.resolved_rate_weight == pytest.approx(3e-4 * 4.0**-quality)
 
 
-def test_without_quality_every_step_is_its_constant() -> None:
-    config = varied(RoundingConfig(rate_weight=0.7), LOG_SCALE_STEP=0.3)
-    assert config.steps(1.0)["offset_scales"] == 0.3
-    assert config.resolved_rate_weight == 0.7
-
-
 def test_a_pixel_is_as_large_as_it_is_seen() -> None:
     """On the arc, at distance 3 with 40 pixels of focal length, a pixel covers 3 / 40."""
     cameras = _cameras(arc_rig(5, radius=3.0))

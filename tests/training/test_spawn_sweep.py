@@ -69,8 +69,7 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
         return swept.backend.draw_views(*args, **options)
 
     counted = replace(swept, backend=swept.backend.with_functions(draw_views=draw_views))
-    known = {entry.view.index: entry for entry in found}
-    for first, second in zip(found, replace(counted, known=known).missing(), strict=True):
+    for first, second in zip(found, counted.missing(known=found), strict=True):
         assert torch.equal(first.residual.missing_share, second.residual.missing_share)
     assert not drawings
     counted.missing()

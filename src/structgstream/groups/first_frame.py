@@ -22,14 +22,13 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.anchors import AnchorCloud
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest
 from structgstream.training.online.config import OnlineConfig, SpawnRules
 from structgstream.training.online.exposure import ExposureReference, with_exposure_of
-from structgstream.training.online.measure import accumulate, measure, primitive_of, sum_by_primitive
+from structgstream.training.online.measure import measure, primitive_sums, slot_count
 from structgstream.training.online.optimize import FrameOptimizer, StartingPoint
-from structgstream.training.online.patching import IDS_PER_FRAME
+from structgstream.training.online.patching import next_identity
 from structgstream.training.online.preprocess import PictureChange, flow_views
 from structgstream.training.online.scene_flow import residual_flow
 from structgstream.training.online.select import select_dynamic
@@ -101,12 +100,16 @@ def _outlier_anchors(
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
-        gaussians = folded.gaussians(small.camera, backend)
-        maps = torch.stack([counting, pixels], dim=-1)
-        of_gaussians = accumulate(gaussians, small.camera, maps, backend, static=active.static)
-        sums = sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)
-        coverage.append(sums[: len(dynamic.anchors), 0])
-        wrong.append(sums[: len(dynamic.anchors), 1])
+        weighed = backend.weigh_views(
+            [folded.gaussians(small.camera, backend)],
+            [small.camera.viewport(pixels)],
+            torch.stack([counting, pixels], dim=-1)[None],
+            slots=slot_count(folded),
+            static=[active.static],
+        )
+        sums = primitive_sums(weighed[0], folded)[: len(dynamic.anchors)]
+        coverage.append(sums[:, 0])
+        wrong.append(sums[:, 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
     return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
@@ -228,7 +231,7 @@ class _Rounds:
                 displaced,
                 inliers,
                 active_tiles,
-                first_identity=self._first_identity(current.free),
+                first_identity=next_identity(current.free.births, fit.frame_index),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
                 config=config.spawn,
@@ -292,11 +295,6 @@ class _Rounds:
             backend=fit.backend,
         )
         return split.displaced(found.displacements), int(found.lifted.sum())
-
-    def _first_identity(self, free: FreeGaussians) -> int:
-        """The first identity of the frame that no earlier round has used."""
-        first = self.fit.frame_index * IDS_PER_FRAME
-        return max(first, int(free.births.max()) + 1) if len(free) else first
 
 
 def _together(results: list[FitResult[Scene]]) -> FitResult[Scene]:

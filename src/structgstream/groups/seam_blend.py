@@ -37,7 +37,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, on_device, scene_of, state_of
 from structgstream.training.neighbours import nearest
 from structgstream.training.online.config import MotionConfig
-from structgstream.training.online.measure import accumulate, measure, primitive_of, sum_by_primitive
+from structgstream.training.online.measure import measure, primitive_sums, slot_count
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.online.select import changed_primitives, select_dynamic
 from structgstream.training.views import View, area_mean
@@ -244,10 +244,10 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
             shown = render(mixed, camera, backend).image
             excess = _excess(shown, pictures.before[name], pictures.first[name])
             excess = area_mean(excess[None, None], (small.height, small.width))
-            gaussians = folded.gaussians(small, backend)
-            maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
-            of_gaussians = accumulate(gaussians, small, maps, backend)
-            sums += sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)[:count]
+            gaussians, slots = folded.gaussians(small, backend), slot_count(folded)
+            maps = torch.stack([torch.ones_like(excess[0]), excess[0]], dim=-1)
+            weighed = backend.weigh_views([gaussians], [small.viewport(maps)], maps, slots=slots)
+            sums += primitive_sums(weighed[0], folded)[:count]
     covered = sums[:, 0]
     return (covered > MIN_COVERED_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
 

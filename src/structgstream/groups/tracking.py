@@ -11,33 +11,33 @@ generated once per camera and frame.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig, enlargement
+from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import TileSelection
+from structgstream.scene.render import as_picture
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
     VISIBLE_PIXELS,
     ViewChange,
-    accumulate,
     flow_evidence,
     primitive_centers,
-    primitive_of,
+    primitive_sums,
     slot_count,
-    sum_by_primitive,
 )
 from structgstream.training.online.preprocess import PictureChange, detect_changes, flow_map
 from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.online.select import inlier_views, occluded_dynamic
 from structgstream.training.online.split import with_displacements
 from structgstream.training.residuals import apply_camera_color
-from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
+from structgstream.training.views import View, area_mean, blackened, training_views
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
@@ -140,7 +140,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
         primitives = moving.nonzero()[:, 0]
         views = [entry.view for entry in seen]
         evidence = flow_evidence([entry.flows[primitives] for entry in seen])
-        centers = primitive_centers(scene, _coverage(seen, scene))
+        centers = primitive_centers(scene, reduce(torch.add, [entry.coverage for entry in seen]))
         priors = PRIOR * past.velocities[primitives]
         found = lift_flow(evidence, centers[primitives], priors, views, backend=tracker.backend)
         velocities[primitives] = found.displacements
@@ -161,8 +161,8 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
 
 @dataclass(frozen=True)
 class _ViewEvidence:
-    """Measurements of one camera: its ``N`` Gaussians in changed tiles, their primitives and coverage ``[N]``, and
-    votes ``[E]`` and sums of flow ``[E, 7]`` of the ``E`` primitives."""
+    """Measurements of one camera: its ``N`` Gaussians in changed tiles and their primitives, coverage by Gaussian id
+    ``[M * K + F]``, and votes ``[E]`` and sums of flow ``[E, 7]`` of the ``E`` primitives."""
 
     view: View
     tiles: TileSelection
@@ -186,14 +186,27 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     # Channels in the order of the evidence, then the changed part. Outside the tiles all are zero and cost nothing.
     colors = change.flow[..., 3:] * inside[..., None]
     maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
-    primitives = primitive_of(gaussians, scene)
-    sums = accumulate(gaussians, small.camera, maps, backend)
-    sums *= _pixel_area(view, size)
-    moved = sum_by_primitive(sums, primitives, scene)
+    sums = _weighed(tracker, scene, gaussians, view, maps)
+    moved = primitive_sums(sums, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.MIN_CHANGED_PIXELS) & (changed > motion.MIN_CHANGED_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
-    return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
+    primitives = _primitives_of(gaussians, scene)
+    return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3].clone(), moved[:, :7], of_view)
+
+
+def _primitives_of(gaussians: Gaussians, scene: Scene) -> Tensor:
+    """Row ``[N]`` of each Gaussian's primitive (Note [Primitives])."""
+    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
+    return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
+
+
+def _weighed(tracker: Tracker, scene: Scene, gaussians: Gaussians, view: View, maps: Tensor) -> Tensor:
+    """Sums ``[M * K + F, C]`` of ``maps`` ``[h, w, C]`` of the reduced ``view`` by Gaussian id, in pixels of the
+    stream's pictures at the reference size, the unit of thresholds."""
+    camera = view.evidence(tracker.config.picture_scale).camera
+    found = tracker.backend.weigh_views([gaussians], [camera.viewport(maps)], maps[None], slots=slot_count(scene))[0]
+    return found.mul_(view.reference_area / (camera.height * camera.width))
 
 
 def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence], moving: Tensor) -> Tensor:
@@ -234,23 +247,7 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     found = flow_map(first, second, counted, size, mask=counted, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps.to(inside.device), inside[..., None], small.colors * inside[..., None]], dim=-1)
-    sums = accumulate(moved, small.camera, maps, backend)
-    sums *= _pixel_area(view, size)
-    return sum_by_primitive(sums, seen.primitives, scene)
-
-
-def _coverage(seen: Sequence[_ViewEvidence], scene: Scene) -> Tensor:
-    """Sum of coverage over all views by Gaussian id, ``[M * K + F]``."""
-    found = torch.zeros(slot_count(scene)).to(scene.anchors.positions)
-    for entry in seen:
-        found[entry.gaussians.ids] += entry.coverage
-    return found
-
-
-def _pixel_area(view: View, size: tuple[int, int]) -> float:
-    """Pixels of the stream's pictures at the reference size, the unit of thresholds, per pixel of the maps."""
-    width, height = view.camera.width, view.camera.height
-    return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
+    return primitive_sums(_weighed(tracker, scene, moved, view, maps), scene)
 
 
 def _counted_pixels(tiles: TileSelection, view: View) -> Tensor:

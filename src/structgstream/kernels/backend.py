@@ -82,8 +82,7 @@ class Backend:
     functions: Mapping[str, Callable[..., Any]]
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
-    rasterize = Operation(reference_raster.rasterize)  # cuda: own kernels; as the eight below
-    blending_weights = Operation(reference_raster.blending_weights)
+    rasterize = Operation(reference_raster.rasterize)  # cuda: own kernels; as the seven below
     generate_views = Operation(ORACLE.generate_views)
     draw_views = Operation(ORACLE.draw_views)
     weigh_views = Operation(ORACLE.weigh_views)

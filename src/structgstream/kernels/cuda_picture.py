@@ -310,9 +310,3 @@ def rasterize(
     )
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
     return RasterOutput(*_Rasterize.apply(scenery, onto, offsets, *(tensor.contiguous() for tensor in tensors)))  # type: ignore[misc]
-
-
-def blending_weights(library: KernelLibrary, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
-    """See ``reference_raster.blending_weights``; waits once for the GPU. Results repeat bit for bit."""
-    rows = Gaussians(**{**gaussians.columns(), "ids": torch.arange(len(gaussians), device=maps.device)})
-    return weigh_views(library, [rows], [viewport], maps[None], slots=len(gaussians))[0]

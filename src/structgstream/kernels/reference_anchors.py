@@ -24,10 +24,11 @@ BALL_INTERVALS = BALL_DEVIATIONS * LOW_PASS_PIXELS**0.5
 """The low-pass of a Gaussian widens its ball by so many sampling intervals."""
 
 
-def visible_anchor_mask(
-    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None
+def visible_anchors(
+    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None = None
 ) -> Tensor:
-    """Mask ``[M]`` bool of the anchors whose ball of Gaussians reaches the picture, or one of the ``tiles``."""
+    """Indices ``[m]`` int64, ascending, of the anchors whose ball of Gaussians reaches the picture, or one of the
+    ``tiles``."""
     size = (viewport.width, viewport.height)
     with torch.no_grad():
         points = anchors.positions @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]  # [M, 3]
@@ -56,7 +57,7 @@ def visible_anchor_mask(
             high[axis] = torch.where(around, float(size[axis]), high[axis])
         if tiles is not None:
             seen &= _reaches(tiles.mask, torch.stack(low, dim=1), torch.stack(high, dim=1), size)
-        return seen
+        return seen.nonzero()[:, 0]
 
 
 def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
@@ -66,13 +67,6 @@ def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) ->
     x0, y0 = (low[:, axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
     x1, y1 = (high[:, axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS + 1 for axis in range(2))
     return covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
-
-
-def visible_anchors(
-    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None = None
-) -> Tensor:
-    """Indices ``[m]`` int64, ascending, of the anchors that :func:`visible_anchor_mask` marks."""
-    return visible_anchor_mask(anchors, viewport, tiles, intervals).nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:

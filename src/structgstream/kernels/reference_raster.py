@@ -228,7 +228,9 @@ def picture_and_weights(
         maps: as for :func:`blending_weights`.
         background: ``[3]``, black when None.
     """
-    return picture_and_weights_by_gradient(rasterize, gaussians, viewport, maps, background=background)
+    with torch.no_grad():
+        image = rasterize(gaussians, viewport, background=background).image
+    return image, blending_weights(gaussians, viewport, maps)
 
 
 def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
@@ -251,20 +253,6 @@ def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: 
             (sums,) = torch.autograd.grad(output.image, colors, cotangent, retain_graph=more)
             found.append(sums[:, : group.shape[-1]])
     return torch.cat(found, dim=1)
-
-
-def picture_and_weights_by_gradient(
-    rasterizer: Rasterizer,
-    gaussians: Gaussians,
-    viewport: Viewport,
-    maps: Tensor,
-    *,
-    background: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """:func:`picture_and_weights` of any rasteriser, in two passes."""
-    with torch.no_grad():
-        image = rasterizer(gaussians, viewport, background=background).image
-    return image, weights_by_gradient(rasterizer, gaussians, viewport, maps)
 
 
 def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:

@@ -39,7 +39,7 @@ class ViewByView:
         generate_structured: of a back-end.
         rasterize: of a back-end.
         projected_radii: extents ``[N]`` on a picture.
-        blending_weights: of a back-end.
+        blending_weights: sums ``[N, C]``, Gaussian by Gaussian.
         picture_and_weights: both in one pass.
     """
 

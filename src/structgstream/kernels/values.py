@@ -74,12 +74,7 @@ class TileSelection:
 
     def count_pixels(self) -> int:
         """Number of pixels in the selected tiles."""
-        rows, columns = self.mask.shape
-        heights = self.mask.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
-        widths = self.mask.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
-        heights[-1] -= rows * TILE_PIXELS - self.height
-        widths[-1] -= columns * TILE_PIXELS - self.width
-        return int(heights @ self.mask.to(torch.int64) @ widths)
+        return int(self._pixels.sum())
 
 
 def tile_pixels(tiles: Sequence[TileSelection]) -> Tensor:

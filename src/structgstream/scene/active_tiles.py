@@ -21,12 +21,12 @@ class ActiveTiles:
         picture: ``[H, W, 3]`` rendering outside the tiles, at least as far as the loss window reads beyond them. It is
             drawn into in place, so its tiles contain the last rendering.
         static: static Gaussians that reach the tiles; without gradient.
-        changed: the tiles whose pixels changed; None if unknown.
+        changed: the tiles whose pixels changed.
         background: ``[3]`` colour behind the scene; None for black.
     """
 
     tiles: TileSelection
     picture: Tensor
     static: Gaussians
-    changed: TileSelection | None = None
+    changed: TileSelection
     background: Tensor | None = None

@@ -45,6 +45,21 @@ class FreeGaussians:
             births=torch.zeros(0, dtype=torch.int64, device=like.device),
         )
 
+    @classmethod
+    def spawned(
+        cls, means: Tensor, log_scales: Tensor, colors: Tensor, *, opacity: float, first_identity: int
+    ) -> "FreeGaussians":
+        """New ones of one ``opacity``, without rotation, whose identities count from ``first_identity``."""
+        count = len(means)
+        return cls(
+            means=means,
+            log_scales=log_scales,
+            quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            logit_opacities=torch.logit(torch.tensor(opacity)).to(means).repeat(count),
+            colors=colors,
+            births=first_identity + torch.arange(count, device=means.device),
+        )
+
     def select(self, rows: Tensor) -> "FreeGaussians":
         """The rows of a mask ``[F]`` or of indices ``[f]``."""
         rows = row_indices(rows, self.means)

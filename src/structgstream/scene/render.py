@@ -101,6 +101,12 @@ def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
         return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, scene.environment))
 
 
+def as_picture(image: Tensor) -> Tensor:
+    """A rendering ``[..., H, W, 3]`` in sRGB as the displayed 8-bit picture: clamped, then rounded."""
+    # In place: a new tensor for each step takes six times as long.
+    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+
+
 def to_8bit_image(image: Tensor) -> NDArray[np.uint8]:
-    """A rendering ``[H, W, 3]`` in sRGB as the displayed 8-bit picture: clamped, then rounded."""
-    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).cpu().numpy()
+    """:func:`as_picture` as an array."""
+    return as_picture(image).cpu().numpy()

@@ -27,6 +27,16 @@ def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
 
 
+BANDWIDTH = 0.7
+"""Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
+
+
+def weights_by_distance(distances: Tensor) -> Tensor:
+    """The weight of each neighbour by its distance ``[P, N]``, ascending."""
+    spread = BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
+    return torch.exp(-0.5 * (distances / spread).square())
+
+
 def nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Rows and distances ``[P, N]`` of the ``count`` (or all) nearest others to each of ``points`` ``[P, 3]``.
 

@@ -4,13 +4,12 @@
 Residuals that frame 0 already had do not indicate change.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
@@ -90,20 +89,9 @@ def _sum_around(values: Tensor, dim: int, reach: int) -> Tensor:
     return total
 
 
-def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
-    """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
-    rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
-    return residual(rendering.image, view, scene.camera_color, backend)
-
-
-def residual(drawn: Tensor, view: View, color: CameraColor, backend: Backend) -> Tensor:
-    """Mean absolute difference ``[H, W]`` of a rendering ``[H, W, 3]`` to the picture of ``view``, over channels and
-    3 x 3 pixels, after the correction ``color`` of its camera; 0 where pixels do not count."""
-    return residuals([drawn], [view], color, backend)[0]
-
-
 def residuals(drawn: Sequence[Tensor], views: Sequence[View], color: CameraColor, backend: Backend) -> Tensor:
-    """:func:`residual` of each of ``views`` of one size, ``[V, H, W]``."""
+    """Mean absolute difference ``[V, H, W]`` of renderings ``[H, W, 3]`` to the pictures of ``views`` of one size, over
+    channels and 3 x 3 pixels, after the corrections ``color`` of their cameras; 0 where pixels do not count."""
     seen, pictures = color.of_cameras([view.index for view in views]), torch.stack([view.image for view in views])
     return backend.picture_residuals(drawn, pictures, gains=seen.gains, biases=seen.biases, masks=stacked_masks(views))
 
@@ -114,25 +102,31 @@ def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend:
 
     Masked pixels are left out; a view that is masked everywhere counts as 0.
     """
-    scene = scene.with_folded_appearance()
     sums = []
-    with torch.no_grad():
-        for view in views:
-            small = view.evidence(scale)
-            found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
-            pixels = found.numel() if small.mask is None else max(int(small.mask.sum()), 1)
-            sums.append(float(found.sum(dtype=torch.float64)) / pixels)
+    for view, found in _reduced_residuals(scene, views, scale, backend):
+        pixels = found.numel() if view.mask is None else max(int(view.mask.sum()), 1)
+        sums.append(float(found.sum(dtype=torch.float64)) / pixels)
     return sum(sums) / max(len(sums), 1)
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
     """Residuals of ``scene``, the decoded frame 0, in pictures reduced by ``scale`` (``View.evidence``)."""
-    scene = scene.with_folded_appearance()
     maps = {}
-    with torch.no_grad():
-        for view in views:
-            small = view.evidence(scale)
-            found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
-            floor = dilated(found, FLOOR_PIXELS // 2)
-            maps[view.index] = floor if small.mask is None else torch.where(small.mask, floor, 1.0)
+    for view, found in _reduced_residuals(scene, views, scale, backend):
+        floor = dilated(found, FLOOR_PIXELS // 2)
+        maps[view.index] = floor if view.mask is None else torch.where(view.mask, floor, 1.0)
     return ResidualFloor(scale, maps)
+
+
+def _reduced_residuals(
+    scene: Scene, views: Sequence[View], scale: float, backend: Backend
+) -> Iterator[tuple[View, Tensor]]:
+    """Each of ``views`` reduced by ``scale`` (``View.evidence``), and the residuals of ``scene`` there."""
+    scene = scene.with_folded_appearance()
+    for view in views:
+        small = view.evidence(scale)
+        with torch.no_grad():
+            gaussians, background = scene.gaussians(small.camera, backend), scene.background(small.camera)
+            drawn = draw(gaussians, small.camera, backend, background=background).image
+            (found,) = residuals([drawn], [small], scene.camera_color, backend)
+        yield small, found

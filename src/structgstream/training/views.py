@@ -167,12 +167,6 @@ def _reduced(views: list[View], scale: float) -> Iterable[View]:
     return [View(view.index, camera, image, mask) for view, camera, image, mask in pictures]
 
 
-def as_picture(image: Tensor) -> Tensor:
-    """A rendering ``[H, W, 3]`` in 0 ... 1 as bytes; what is beyond is clamped."""
-    # In place: a new tensor for each step takes six times as long.
-    return image.clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
-
-
 def _reduced_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
     """The bytes ``[V, H, W, 3]`` averaged down to ``size``, h and w."""
     count, height, width = pictures.shape[:3]

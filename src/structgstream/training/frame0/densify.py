@@ -1,15 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Growing and pruning of anchors in frame 0.
-
-Growing and pruning anchors during frame 0, after Scaffold-GS (Lu et al., CVPR 2024).
-
-Contribution of each anchor to the training pictures, used to prune anchors that are hardly visible.
-
-Applies growing and pruning of anchors to parameters, optimiser moments and statistics.
-"""
+"""Growing and pruning of anchors in frame 0, after Scaffold-GS (Lu et al., CVPR 2024)."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -127,10 +120,31 @@ class NewAnchors:
         return NewAnchors(self.positions[rows], self.cell_sizes[rows], self.features[rows], self.strengths[rows])
 
 
-def cell_keys(points: Tensor, cell: float, origin: Tensor, extent: Tensor) -> Tensor:
-    """An int64 key of the cell of each point ``[P, 3]``; ``origin``, ``extent`` ``[3]`` int64 bound all cells."""
-    cells = (points / cell).round().to(torch.int64) - origin
-    return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+class FreshCells(NamedTuple):
+    """Cells that hold some of ``P`` points and none of others.
+
+    Args:
+        fresh: mask ``[P]`` of the points in such cells.
+        cell_of: ``[p]``, the cell of each of these.
+        cells: ``[C, 3]`` int64, in units of a cell's side.
+    """
+
+    fresh: Tensor
+    cell_of: Tensor
+    cells: Tensor
+
+
+def fresh_cells(points: Tensor, occupied: Tensor, cell: float) -> FreshCells:
+    """The cells of side ``cell`` that hold some of ``points`` ``[P, 3]`` and none of ``occupied``, ascending."""
+    cells = (torch.cat([points, occupied]) / cell).round().to(torch.int64)
+    origin = cells.amin(0)
+    x, y, z = (cells - origin).unbind(1)
+    _, rows, columns = (cells.amax(0) - origin + 1).unbind()
+    keys, others = ((x * rows + y) * columns + z).split([len(points), len(occupied)])
+    fresh = ~torch.isin(keys, others)
+    unique, index = keys[fresh].unique(return_inverse=True)
+    found = torch.stack([unique // (rows * columns), unique // columns % rows, unique % columns], dim=1)
+    return FreshCells(fresh, index, found + origin)
 
 
 def grow(
@@ -196,19 +210,13 @@ def _new_cells(means: Tensor, features: Tensor, strengths: Tensor, *, occupied: 
 
     It gets the largest of their ``features`` ``[n, D]``, column by column, and of their ``strengths`` ``[n]``.
     """
-    coordinates = (torch.cat([means, occupied]) / cell).round().to(torch.int64)
-    origin = coordinates.amin(0)
-    extent = coordinates.amax(0) - origin + 1
-    keys = cell_keys(means, cell, origin, extent)
-    fresh = ~torch.isin(keys, cell_keys(occupied, cell, origin, extent))
-    unique, index = keys[fresh].unique(return_inverse=True)
-    parents = features[fresh]
-    largest = parents.new_full((len(unique), parents.shape[1]), -torch.inf)
+    fresh, index, cells = fresh_cells(means, occupied, cell)
+    parents, count = features[fresh], len(cells)
+    largest = parents.new_full((count, parents.shape[1]), -torch.inf)
     largest.scatter_reduce_(0, index[:, None].expand_as(parents), parents, reduce="amax")
-    strongest = strengths.new_zeros(len(unique)).scatter_reduce_(0, index, strengths[fresh], reduce="amax")
-    cells = torch.stack([unique // (extent[1] * extent[2]), unique // extent[2] % extent[1], unique % extent[2]], dim=1)
-    positions = (cells + origin).to(means) * cell
-    return NewAnchors(positions, positions.new_full((len(unique),), cell), largest, strongest)
+    strongest = strengths.new_zeros(count).scatter_reduce_(0, index, strengths[fresh], reduce="amax")
+    positions = cells.to(means) * cell
+    return NewAnchors(positions, positions.new_full((count,), cell), largest, strongest)
 
 
 def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
@@ -252,10 +260,8 @@ class Densifier:
         c = self.config
         return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
-    def apply(
-        self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int
-    ) -> tuple[int, int]:
-        """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
+    def apply(self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int) -> None:
+        """Grow, then prune, after ``iteration``."""
         k = self.offsets_per_anchor
         new = grow(
             scene.anchors,
@@ -269,18 +275,16 @@ class Densifier:
         eligible = self.gradients.count > self.config.eligible_count
         self.gradients.total[eligible] = 0.0
         self.gradients.count[eligible] = 0.0
-        remove = prunable_mask(self.opacities, self.config)
+        keep = ~prunable_mask(self.opacities, self.config)
         judged = self.opacities.visits > self.config.prune_visits
         self.opacities.opacity[judged] = 0.0
         self.opacities.visits[judged] = 0.0
-        keep = ~remove
         log_cells = new.cell_sizes.log()[:, None].expand(-1, 3)
         anchors = AnchorCloud(
             new.positions, log_cells, log_cells, new.positions.new_zeros(len(new), k, 3), new.features
         )
         self._replace(adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
         adam.values["base_scales"].detach().clamp_(max=0.05)
-        return len(new), int(remove.sum())
 
     def _replace(
         self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int

@@ -140,8 +140,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     parameters: Parameters
     adam: Adam[ParameterName]
     densifier: Densifier
-    views: list[View]
-    extent: float
     generator: torch.Generator
     numbers: RandomNumbers
     watch: Stopwatch
@@ -223,7 +221,18 @@ def fit_first_frame(
         roving: pictures of a roving camera, in normalised units; every second iteration takes one of them.
     """
     generator = torch.Generator().manual_seed(seed)
-    template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
+    template = seeded_scene(
+        points,
+        cameras=len(rig.training),
+        voxel_size=config.voxel_size * config.seed_voxels,
+        offsets_per_anchor=config.offsets_per_anchor,
+        feature_width=config.FEATURE_WIDTH,
+        hidden_width=config.HIDDEN_WIDTH,
+        distance_input=config.distance_input,
+        device=backend.device,
+        generator=generator,
+        all_drawn=config.all_drawn,
+    )
     return _fit(
         frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step, roving=roving
     )
@@ -293,8 +302,6 @@ def _fit(
         parameters,
         adam,
         densifier,
-        views,
-        extent,
         generator,
         numbers,
         watch,
@@ -321,24 +328,6 @@ def _fit(
         counts=counts,
         seconds=watch.seconds,
         losses=last_pass.terms,
-    )
-
-
-def _seeded(
-    points: Tensor, *, cameras: int, config: InitialConfig, device: torch.device, generator: torch.Generator
-) -> Scene:
-    """The initial scene of frame 0."""
-    return seeded_scene(
-        points,
-        cameras=cameras,
-        voxel_size=config.voxel_size * config.seed_voxels,
-        offsets_per_anchor=config.offsets_per_anchor,
-        feature_width=config.FEATURE_WIDTH,
-        hidden_width=config.HIDDEN_WIDTH,
-        distance_input=config.distance_input,
-        device=device,
-        generator=generator,
-        all_drawn=config.all_drawn,
     )
 
 

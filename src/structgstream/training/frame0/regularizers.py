@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps frame 0 from explaining each camera alone.
-
-Regularisation of frame 0 against overfitting to the training views: Gaussian dropout and random perturbation.
+"""What keeps frame 0 from explaining each camera alone: dropout and noise, a depth regulariser, and the removal of
+floaters.
 
 A rig sees a surface from few directions, so combinations of Gaussians can fit the training views and be wrong between
 them. Dropping some Gaussians and perturbing the others in every iteration gives such combinations a large loss.
 
-A regulariser of frame 0 that concentrates the Gaussians along a ray in depth.
-
 A haze of faint Gaussians around a surface can fit every training view and be wrong in all others; its depths along a
-ray are spread. The loss is the standard deviation of depth relative to its mean (compare the distortion loss of
+ray are spread. The regulariser is the standard deviation of depth relative to its mean (compare the distortion loss of
 Mip-NeRF 360, Barron et al., CVPR 2022).
-
-Anchors in free space that one or few cameras need and the others see through; they are removed from frame 0.
 
 Note [Free space]
 ~~~~~~~~~~~~~~~~~
@@ -23,8 +18,9 @@ something behind it, and hardly any of them draws it. What masks leave out is no
 an empty room, would see through the people of frame 0.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -86,42 +82,31 @@ class RandomNumbers:
         return table[first : first + count]
 
 
-class Perturbation:
-    """Perturbs the Gaussians of one iteration.
-
-    Args:
-        config: amounts of dropout and noise.
-        numbers: to perturb with.
-        strength: factor on the amounts, 0 to 1.
-    """
-
-    def __init__(self, config: PerturbationConfig, numbers: RandomNumbers, *, strength: float) -> None:
-        self._config = config
-        self._numbers = numbers
-        self._strength = strength
-
-    def __call__(self, gaussians: Gaussians) -> Gaussians:
-        dropped, noise = (self._strength * x for x in (self._config.dropped_share, self._config.noise_scales))
-        opacities, means = gaussians.opacities, gaussians.means
-        if dropped > 0.0:
-            kept = (self._numbers.uniform(len(gaussians)) >= dropped).to(opacities)
-            opacities = (opacities * kept.div_(1.0 - dropped)).clamp(max=0.999)
-        if noise > 0.0:
-            # Isotropic noise by the mean scale: following each Gaussian's rotation is not worth its cost.
-            x, y, z = gaussians.scales.detach().unbind(1)
-            sizes = (x + y).add_(z).mul_(noise / 3.0)  # by columns: a mean of three takes six times as long
-            means = means + sizes[:, None] * self._numbers.normal(len(gaussians)).to(means)
-        return replace(gaussians, opacities=opacities, means=means)
+def perturbed(
+    gaussians: Gaussians, config: PerturbationConfig, numbers: RandomNumbers, *, strength: float
+) -> Gaussians:
+    """The Gaussians of one iteration with dropout and noise; ``strength``, 0 to 1, is a factor on their amounts."""
+    dropped, noise = strength * config.dropped_share, strength * config.noise_scales
+    opacities, means = gaussians.opacities, gaussians.means
+    if dropped > 0.0:
+        kept = (numbers.uniform(len(gaussians)) >= dropped).to(opacities)
+        opacities = (opacities * kept.div_(1.0 - dropped)).clamp(max=0.999)
+    if noise > 0.0:
+        # Isotropic noise by the mean scale: following each Gaussian's rotation is not worth its cost.
+        x, y, z = gaussians.scales.detach().unbind(1)
+        sizes = (x + y).add_(z).mul_(noise / 3.0)  # by columns: a mean of three takes six times as long
+        means = means + sizes[:, None] * numbers.normal(len(gaussians)).to(means)
+    return replace(gaussians, opacities=opacities, means=means)
 
 
 def perturbation_at(
     iteration: int, iterations: int, config: PerturbationConfig, numbers: RandomNumbers
-) -> Perturbation | None:
-    """The perturbation of ``iteration`` of ``iterations``; None for none."""
+) -> Callable[[Gaussians], Gaussians] | None:
+    """:func:`perturbed` in ``iteration`` of ``iterations``; None for none."""
     strength = 1.0 - iteration / max(1.0, iterations * config.UNTIL_SHARE)
     if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None
-    return Perturbation(config, numbers, strength=strength)
+    return partial(perturbed, config=config, numbers=numbers, strength=strength)
 
 
 COVERED = 0.5

@@ -35,7 +35,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.frame0.densify import cell_keys
+from structgstream.training.frame0.densify import fresh_cells
 from structgstream.training.neighbours import nearest
 from structgstream.training.views import View
 
@@ -187,16 +187,10 @@ def warm_start(scene: Scene, *, cell: float) -> Scene:
 
 def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> AnchorCloud:
     """An anchor for each cell that free Gaussians are in and no anchors: at their mean, as large as they are."""
-    both = torch.cat([free.means, anchors.positions])
-    places = (both / cell).round().to(torch.int64)
-    origin = places.amin(0)
-    extent = places.amax(0) - origin + 1
-    keys = cell_keys(free.means, cell, origin, extent)
-    fresh = ~torch.isin(keys, cell_keys(anchors.positions, cell, origin, extent))
-    unique, index, count = keys[fresh].unique(return_inverse=True, return_counts=True)
+    fresh, index, cells = fresh_cells(free.means, anchors.positions, cell)
+    count = index.bincount(minlength=len(cells))
     rows = torch.cat([free.means[fresh], free.log_scales[fresh].amax(1, keepdim=True)], dim=1)
-    sums = rows.new_zeros(len(unique), 4).index_add_(0, index, rows)
-    means = sums / count[:, None]
+    means = rows.new_zeros(len(cells), 4).index_add_(0, index, rows) / count[:, None]
     # A Gaussian is at most as large as the base scale, and half of it on average.
     log_scales = (means[:, 3:] + np.log(2.0)).expand(-1, 3)
     return replace(
@@ -204,5 +198,5 @@ def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> Ancho
         positions=means[:, :3].contiguous(),
         log_offset_scales=log_scales.contiguous(),
         log_base_scales=log_scales.contiguous(),
-        offsets=means.new_zeros(len(unique), anchors.offsets_per_anchor, 3),
+        offsets=means.new_zeros(len(cells), anchors.offsets_per_anchor, 3),
     )

@@ -169,9 +169,9 @@ class SpawnConfig:
 
     RULES: ClassVar[SpawnRules] = SpawnRules()
     """Of the first sweep."""
-    CHANGED_FLOOR_MEDIANS: ClassVar[float | None] = 1.0
+    CHANGED_FLOOR_MEDIANS: ClassVar[float] = 1.0
     """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
-    of its view's. None: all of it counts, as it does in the sweep for thin content."""
+    of its view's. In the sweep for thin content all of it counts."""
 
     @property
     def rules(self) -> SpawnRules:
@@ -195,8 +195,6 @@ class SmoothnessConfig:
 
     NEIGHBOURS: ClassVar[int] = 8
     """Number of nearest dynamic anchors that an anchor is compared with."""
-    BANDWIDTH: ClassVar[float] = 0.7
-    """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
     FEATURE_BANDWIDTH: ClassVar[float] = 1.0
     """Standard deviation of the Gaussian weight of a neighbour by the root mean square difference of features, in their
     standard deviations. 0: no weight by features."""

@@ -111,10 +111,11 @@ def fit_next_frame(
             config=config.spawn,
             backend=backend,
         )
+    anchors, free = flow.displacements.tensor_split([len(split.dynamic.anchors)])
     start = StartingPoint(
         replace(split.dynamic, free=split.dynamic.free.select(spawned.kept)),
         inliers,
-        torch.cat([flow.anchor_displacements, flow.free_displacements[spawned.kept]]),
+        torch.cat([anchors, free[spawned.kept]]),
         split,
         flow.active_tiles,
         spawned.new_free,

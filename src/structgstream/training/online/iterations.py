@@ -90,7 +90,7 @@ class StartingPoint:
     displacements: Tensor
     split: DynamicSplit | None = None
     active_tiles: Mapping[int, ActiveTiles] | None = None
-    new_free: FreeGaussians | None = None
+    new_free: FreeGaussians = field(default_factory=FreeGaussians.empty)
     reference: Scene | None = None
 
     @property
@@ -101,11 +101,8 @@ class StartingPoint:
     @property
     def seen(self) -> list[View]:
         """The views in which the scene is visible."""
-        return (
-            self.views
-            if self.active_tiles is None
-            else [view for view in self.views if view.index in self.active_tiles]
-        )
+        active = self.active_tiles
+        return self.views if active is None else [view for view in self.views if view.index in active]
 
 
 @dataclass
@@ -173,14 +170,9 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         """The tiles of the view that the scene reaches; None for whole pictures."""
         return None if self.start.active_tiles is None else self.start.active_tiles[sample.index]
 
-    def _alternates(self, sample: View) -> bool:
-        """Whether some visits of the view are without the tiles in which nothing has changed."""
-        active = self.active_tiles_of(sample)
-        return active is not None and active.changed is not None and self.rest_every > 1
-
     def _rests(self, sample: View) -> bool:
         """Whether this visit of the view is without the tiles in which nothing has changed."""
-        return self._alternates(sample) and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
+        return self.start.active_tiles is not None and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
 
     def _tracks_screen(self, iteration: int) -> bool:
         patching = self.free_set.config
@@ -204,10 +196,10 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     def patch(self, sample: View) -> bool:
         """Prunes and spawns free Gaussians; whether any came or went."""
         with self.watch.stage("patch"), torch.no_grad():
-            version, survivors = self.free_set.version, self.free_set.patch(sample)
-            if self.rate_term is not None and self.free_set.version != version:
+            survivors = self.free_set.patch(sample)
+            if self.rate_term is not None and survivors is not None:
                 self.rate_term = self.rate_term.after_pruning(survivors)
-        return self.free_set.version != version
+        return survivors is not None
 
     def counts(self) -> tuple[int, int]:
         split = self.start.split
@@ -319,7 +311,7 @@ def _view(view: View, hooks: OnlineHooks) -> FitView:
         picture=view.image,
         mask=view.mask,
         tiles=active.tiles,
-        changed=active.tiles if active.changed is None else active.changed,
+        changed=active.changed,
         gains=scene.camera_color.gains[view.index],
         biases=scene.camera_color.biases[view.index],
         background=active.background,

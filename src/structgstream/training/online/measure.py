@@ -15,8 +15,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera
-from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
@@ -52,37 +50,9 @@ class FlowEvidence:
         return FlowEvidence(self.weights[:, primitives], self.flows[:, primitives], self.colors[primitives])
 
 
-def accumulate(
-    gaussians: Gaussians, camera: Camera, maps: Tensor, backend: Backend, *, static: Gaussians | None = None
-) -> Tensor:
-    """Sums of ``maps`` ``[h, w, C]`` over the pixels by blending weight, of each Gaussian: ``[N, C]``.
-
-    Args:
-        gaussians: for the camera.
-        camera: of the maps' size.
-        maps: to sum.
-        backend: the compute back-end.
-        static: further Gaussians, which only take part in occlusion.
-    """
-    drawn = gaussians if static is None else concatenate(gaussians, static)
-    return backend.blending_weights(drawn, camera.viewport(drawn.means), maps)[: len(gaussians)]
-
-
 def slot_count(scene: Scene) -> int:
     """Number of ids in a scene (Note [Ids])."""
     return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-
-
-def primitive_of(gaussians: Gaussians, scene: Scene) -> Tensor:
-    """Row ``[N]`` of each Gaussian's primitive (Note [Primitives])."""
-    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
-    return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
-
-
-def sum_by_primitive(sums: Tensor, primitives: Tensor, scene: Scene) -> Tensor:
-    """Sums ``[N, C]`` of Gaussians as sums of primitives, ``[M + F, C]``; ``primitives`` as of :func:`primitive_of`."""
-    found = sums.new_zeros(len(scene.anchors) + len(scene.free), sums.shape[1])
-    return found.index_add_(0, primitives, sums)
 
 
 def primitive_sums(sums: Tensor, scene: Scene) -> Tensor:

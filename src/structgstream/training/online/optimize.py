@@ -20,7 +20,6 @@ import torch
 
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
 from structgstream.training.losses import GradientStatistics
@@ -83,7 +82,7 @@ class FrameOptimizer:
             template=start.scene,
             parameters=parameters,
             adam=adam,
-            statistics=GradientStatistics(slot_count(start.scene) + _length(start.new_free), self.backend.device),
+            statistics=GradientStatistics(slot_count(start.scene) + len(start.new_free), self.backend.device),
             views=seen,
             frame_index=self.frame_index,
             room=config.patching.max_free - (0 if split is None else len(split.static.free)),
@@ -134,8 +133,7 @@ class FrameOptimizer:
         patching = self.config.patching
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
         splits = None not in (start.active_tiles, start.split)
-        fits = splits and not tracks_screen and not unknown_natively(self.config, start.scene)
-        return self.backend.iterations is not None and fits
+        return splits and not tracks_screen and not unknown_natively(self.config, start.scene)
 
     def _patch_at(self, start: StartingPoint) -> int:
         return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
@@ -160,10 +158,6 @@ def rest_every(most: int, *, views: int, iterations: int) -> int:
     return max(1, min(most, iterations // max(views, 1)))
 
 
-def _length(free: FreeGaussians | None) -> int:
-    return 0 if free is None else len(free)
-
-
 def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], start: StartingPoint) -> None:
     """Set the leaves to the frame's initial state, with the spawned Gaussians."""
     values, anchors = parameters.values, len(start.scene.anchors)
@@ -172,7 +166,7 @@ def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], star
     if not values["free_means"].requires_grad:
         return
     values["free_means"].data += start.displacements[anchors:]
-    if start.new_free is not None and len(start.new_free):
+    if len(start.new_free):
         keep = torch.ones(len(start.scene.free), dtype=torch.bool)
         parameters.births = torch.cat([parameters.births, start.new_free.births])
         adam.replace_rows(values_of_rows(start.new_free, FREE_ROWS), keep=keep)

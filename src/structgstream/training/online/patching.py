@@ -16,6 +16,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import PatchingConfig
+from structgstream.training.online.measure import slot_count
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, values_of_rows
 from structgstream.training.views import View
@@ -61,8 +62,7 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
     Ids that no view draws (opacity 0) are left out.
     """
     found: list[Gaussians] = [_empty_like(scene)]
-    slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-    missing = torch.zeros(slots, dtype=torch.bool, device=ids.device)
+    missing = torch.zeros(slot_count(scene), dtype=torch.bool, device=ids.device)
     missing[ids] = True
     for view in views:
         if not missing.any():
@@ -98,16 +98,14 @@ def spawn_children(
         z = torch.randn(count, 3, generator=generator).to(parents.means)
         local = (config.COVARIANCE_FACTOR**0.5) * parents.scales * z
         means = parents.means + (quaternion_matrices(parents.quats) @ local[:, :, None])[:, :, 0]
-    unit = parents.means.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.tensor(config.OPACITY)
-    return FreeGaussians(
-        means=means,
-        log_scales=parents.scales.clamp(min=1e-9).log(),
-        quats=unit.expand(count, 4).clone(),
-        logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
-        colors=parents.colors.clone(),
-        births=first_identity + torch.arange(count, device=parents.means.device),
-    )
+    log_scales, colors = parents.scales.clamp(min=1e-9).log(), parents.colors.clone()
+    return FreeGaussians.spawned(means, log_scales, colors, opacity=config.OPACITY, first_identity=first_identity)
+
+
+def next_identity(births: Tensor, frame_index: int) -> int:
+    """The first identity of a frame that is beyond all ``births``, of which some may be of this frame already."""
+    first = frame_index * IDS_PER_FRAME
+    return max(first, int(births.max()) + 1) if len(births) else first
 
 
 @dataclass
@@ -127,7 +125,6 @@ class FreeSet:
         generator: of random numbers.
         spawned: number of spawned ones so far.
         pruned: number of pruned ones so far.
-        version: how often rows came or went; between, the tensors stay where they are.
     """
 
     config: PatchingConfig
@@ -142,13 +139,12 @@ class FreeSet:
     generator: torch.Generator
     spawned: int = 0
     pruned: int = 0
-    version: int = 0
 
     def __len__(self) -> int:
         return len(self.parameters.births)
 
-    def patch(self, view: View) -> Tensor:
-        """Prunes and spawns; returns the mask of the survivors.
+    def patch(self, view: View) -> Tensor | None:
+        """Prunes and spawns; returns the mask of the survivors, or None if none came or went.
 
         A child copies its parent's appearance in ``view``, if that draws it, else in the first other view that does.
         """
@@ -159,13 +155,12 @@ class FreeSet:
         children = spawn_children(
             parents,
             current.anchors.positions,
-            first_identity=self._next_identity(),
+            first_identity=next_identity(self.parameters.births, self.frame_index),
             config=self.config,
             generator=self.generator,
         )
         if keep.all() and not len(children):
-            return keep
-        self.version += 1
+            return None
         self.parameters.births = torch.cat([self.parameters.births[keep], children.births])
         self.adam.replace_rows(values_of_rows(children, FREE_ROWS), keep=keep)
         self.spawned, self.pruned = self.spawned + len(children), self.pruned + int((~keep).sum())
@@ -182,9 +177,3 @@ class FreeSet:
             config=self.config,
             generator=self.generator,
         )
-
-    def _next_identity(self) -> int:
-        first = self.frame_index * IDS_PER_FRAME
-        births = self.parameters.births
-        # Some may have been spawned in this frame already.
-        return max(first, int(births.max()) + 1) if len(births) else first

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import floor, log2
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -227,30 +228,18 @@ def _are_repeated(then: Tensor, now: Tensor, masks: Tensor | None, *, same: list
     return [row in repeated for row in range(len(now))]
 
 
-@dataclass(frozen=True)
-class FlowMaps:
+class FlowMaps(NamedTuple):
     """Flow between two pictures of one camera with confidence c, the share of consistent pixels.
 
     Args:
         maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``Backend.confident_flow``).
-        far_boxes: number of boxes in which large motion was searched for.
-        far_pixels: number of changed pixels for which that search found a consistent flow.
-        recolored_pixels: number of changed pixels whose flow leads to another colour, in either search.
+        counts: for the log: the boxes in which large motion was searched for (``far boxes``), the changed pixels for
+            which that search found a consistent flow (``far pixels``), and those whose flow leads to another colour,
+            in either search (``recolored pixels``).
     """
 
     maps: Tensor
-    far_boxes: int = 0
-    far_pixels: int = 0
-    recolored_pixels: int = 0
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """What the search did, for the log."""
-        return {
-            "far boxes": self.far_boxes,
-            "far pixels": self.far_pixels,
-            "recolored pixels": self.recolored_pixels,
-        }
+    counts: Mapping[str, int]
 
 
 def flow_map(
@@ -279,7 +268,7 @@ def flow_map(
         MissingExtraError: OpenCV is not installed.
     """
     maps = torch.zeros(3, *changed.shape)
-    far_pixels = recolored_pixels = 0
+    counts = {"far boxes": 0, "far pixels": 0, "recolored pixels": 0}
     where = changed.numpy()
     longer = max(where.shape)
     level = 1 if longer // 2 >= MIN_SEARCH_PIXELS else 0
@@ -294,28 +283,26 @@ def flow_map(
         flow: NDArray[np.float32],
         back: NDArray[np.float32],
     ) -> Tensor:
-        nonlocal recolored_pixels
         alike = torch.from_numpy(same_color(earlier, later, flow, radius=radius))
-        recolored_pixels += int(where[box][~alike.numpy()].sum())
-        counts = alike if mask is None else alike & mask[box]
+        counts["recolored pixels"] += int(where[box][~alike.numpy()].sum())
+        counting = alike if mask is None else alike & mask[box]
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
-        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
+        return backend.confident_flow(forward, backward, counting, relative=RELATIVE, absolute=ABSOLUTE)
 
     cell = max(1, round(longer / CELLS))
     for box in _boxes(where, context):
         earlier, later = _cut(first, box), _cut(second, box)
         maps[:, *box] = consistent(box, earlier, later, search(earlier, later), search(later, earlier))
-    far = _far_boxes(where, maps[0].numpy() > 0.0, cell)
-    for box in far:
+    for box in _far_boxes(where, maps[0].numpy() > 0.0, cell):
         earlier, later = _cut(first, box), _cut(second, box)
         flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
         refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
         found = consistent(box, earlier, later, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
-        far_pixels += int((missing & (found[0] > 0.0)).sum())
+        counts["far boxes"] += 1
+        counts["far pixels"] += int((missing & (found[0] > 0.0)).sum())
         maps[:, *box] = torch.where(missing, found, maps[:, *box])
-    small = area_mean(maps[None], size)[0].permute(1, 2, 0)
-    return FlowMaps(small, len(far), far_pixels, recolored_pixels)
+    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0), counts)
 
 
 Box = tuple[slice, slice]

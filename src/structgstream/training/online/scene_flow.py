@@ -10,6 +10,7 @@ these pictures, which also corrects errors of earlier frames.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -17,8 +18,9 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import Neighbors, ViewFlows, tile_pixels
 from structgstream.scene.active_tiles import ActiveTiles
+from structgstream.scene.render import as_picture
 from structgstream.scene.scene import Scene
-from structgstream.training.neighbours import nearest
+from structgstream.training.neighbours import nearest, weights_by_distance
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.measure import (
     FlowEvidence,
@@ -32,7 +34,6 @@ from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import recorded
 from structgstream.training.views import (
     View,
-    as_picture,
     blackened,
     by_size,
     evidence_views,
@@ -42,8 +43,6 @@ from structgstream.training.views import (
 
 NEIGHBOURS = 12
 """Number of nearest primitives, including itself, to whose flow a displacement is fitted."""
-BANDWIDTH = 0.7
-"""Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
 COLOR_BANDWIDTH = 0.15
 """Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
 adjacent objects."""
@@ -91,9 +90,7 @@ def lift_flow(
     if not len(informed):
         return LiftedFlow(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
     near, distances = nearest(points, points[informed], NEIGHBOURS)
-    neighbours, distances = informed[near].to(centers.device), distances.to(centers.device)
-    spread = BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
-    affinities = torch.exp(-0.5 * (distances / spread).square())
+    neighbours, affinities = informed[near].to(centers.device), weights_by_distance(distances.to(centers.device))
     apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
     affinities = affinities * torch.exp(-0.5 * apart / COLOR_BANDWIDTH**2)
     viewports = [view.camera.viewport(centers) for view in views]
@@ -118,6 +115,11 @@ FAST_SHARE = 1 / 80
 """Flow per frame, relative to the longer side of the pictures, above which motion counts as fast: 8 of 640 pixels."""
 
 
+COUNTS = ("displaced", "corrected", "fast", "fast displaced")
+"""Primitives displaced by flow between pictures; by flow from the rendering; those whose flow between pictures is
+larger than :data:`FAST_SHARE`; and of these the displaced ones, as the others are likely to leave ghosts."""
+
+
 @dataclass(frozen=True)
 class SceneFlow:
     """The initial scene flow of a split's dynamic part.
@@ -126,39 +128,13 @@ class SceneFlow:
         split: with its dynamic part displaced.
         displacements: ``[M + F, 3]`` of the dynamic part from its last positions.
         active_tiles: by view index, the tiles that it reaches.
-        lifted: number of primitives displaced by flow between pictures.
-        corrected: number of primitives displaced by flow from the rendering.
-        fast: number of primitives whose flow between pictures is larger than :data:`FAST_SHARE`.
-        fast_lifted: how many of them are displaced by it; the others are likely to leave ghosts.
+        counts: for the log, of primitives (:data:`COUNTS`).
     """
 
     split: DynamicSplit
     displacements: Tensor
     active_tiles: Mapping[int, ActiveTiles]
-    lifted: int = 0
-    corrected: int = 0
-    fast: int = 0
-    fast_lifted: int = 0
-
-    @property
-    def anchor_displacements(self) -> Tensor:
-        """Those of anchors, ``[M, 3]``."""
-        return self.displacements[: len(self.split.dynamic.anchors)]
-
-    @property
-    def free_displacements(self) -> Tensor:
-        """Those of free Gaussians, ``[F, 3]``."""
-        return self.displacements[len(self.split.dynamic.anchors) :]
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How much of what moves was displaced, for the log."""
-        return {
-            "displaced": self.lifted,
-            "corrected": self.corrected,
-            "fast": self.fast,
-            "fast displaced": self.fast_lifted,
-        }
+    counts: Mapping[str, int]
 
 
 def apply_scene_flow(
@@ -197,9 +173,9 @@ def apply_scene_flow(
     """
     selection = split.selection
     if not config.enabled or selection.evidence is None or selection.centers is None or not len(priors):
-        moved = split.displaced(priors)
         # Tiles are those that the last positions reach, with a margin for motion.
-        return SceneFlow(moved, priors, find_active_tiles(split, views, config=motion, backend=backend))
+        active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
+        return SceneFlow(split.displaced(priors), priors, active_tiles, dict.fromkeys(COUNTS, 0))
 
     dynamic = selection.primitives
     evidence, centers = selection.evidence.select(dynamic), selection.centers[dynamic]
@@ -215,9 +191,9 @@ def apply_scene_flow(
             moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, backend=backend
         )
         displacements, corrected = displacements + second.displacements, second.lifted
-    masks = {"lifted": first.lifted, "corrected": corrected, "fast": fast, "fast_lifted": fast & first.lifted}
-    counts = dict(zip(masks, torch.stack(list(masks.values())).sum(1).tolist(), strict=True))
-    return SceneFlow(split.displaced(displacements), displacements, active_tiles, **counts)
+    counts = torch.stack([first.lifted, corrected, fast, fast & first.lifted]).sum(1).tolist()
+    moved = split.displaced(displacements)
+    return SceneFlow(moved, displacements, active_tiles, dict(zip(COUNTS, counts, strict=True)))
 
 
 def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:
@@ -265,9 +241,7 @@ def residual_flow(
             lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, backend=backend),
         )
     evidence = flow_evidence([primitive_sums(of_view, folded) for of_view in found])
-    coverage = found[0][:, 3]
-    for of_view in found[1:]:
-        coverage = coverage + of_view[:, 3]
+    coverage = reduce(torch.add, [of_view[:, 3] for of_view in found])
     return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, backend=backend)
 
 

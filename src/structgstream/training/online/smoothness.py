@@ -16,7 +16,7 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.scene.scene import Scene
-from structgstream.training.neighbours import nearest_others
+from structgstream.training.neighbours import nearest_others, weights_by_distance
 from structgstream.training.online.config import SmoothnessConfig
 from structgstream.training.parameters import pixel_size
 
@@ -61,8 +61,7 @@ class MotionSmoothness:
         if pixel is None:
             return None
         rows, distances = (found.to(positions.device) for found in nearest_others(points, config.NEIGHBOURS))
-        spread = config.BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
-        affinities = torch.exp(-0.5 * (distances / spread).square())
+        affinities = weights_by_distance(distances)
         if config.FEATURE_BANDWIDTH > 0.0:
             features = scene.features.detach()
             features = features / features.std(0).clamp(min=1e-6)

@@ -8,7 +8,7 @@ Gaussians that are outliers in several views are pruned first.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,8 +95,8 @@ def spawn_by_sweep(
     for index, view in enumerate(views):
         if missing[index].missing_pixels == 0.0:
             continue
-        lacking = view.missing > 0.5
-        rows, columns = (lacking & _strided_mask(rules.pixel_step, lacking)).nonzero().unbind(1)
+        step = rules.pixel_step
+        rows, columns = (step * (view.missing[::step, ::step] > 0.5).nonzero()).unbind(1)
         reachable = torch.where(view.depths.isfinite(), view.depths, -torch.inf).max()
         beyond = torch.where(reachable.isfinite(), reachable, 1e3 * view.near)
         farthest = (1.02 * torch.minimum(view.depths[rows, columns], beyond)).clamp(min=1.001 * view.near)
@@ -112,7 +112,7 @@ def spawn_by_sweep(
         z, x, y = swept.depths, columns + 0.5, rows + 0.5
         K, viewmat = view.K, view.viewmat
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
-        points, spacings = (local - viewmat[:3, 3]) @ viewmat[:3, :3], rules.pixel_step * z / K[0, 0]
+        points, spacings = (local - viewmat[:3, 3]) @ viewmat[:3, :3], step * z / K[0, 0]
         values.append(torch.cat([points, view.colors[rows, columns], spacings[:, None]], dim=1))
         costs.append(swept.costs)
     none, like = Spawned(FreeGaussians.empty(views[0].colors)), views[0].colors
@@ -137,13 +137,6 @@ def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> Swee
     return SweepView(colors, entry.missing_share, depths, viewport.viewmat, viewport.K, camera.near)
 
 
-def _strided_mask(step: int, like: Tensor) -> Tensor:
-    """Mask of every ``step``-th pixel across and down."""
-    mask = torch.zeros_like(like)
-    mask[::step, ::step] = True
-    return mask
-
-
 def _merge_points(
     points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
 ) -> Spawned:
@@ -152,7 +145,8 @@ def _merge_points(
         from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
-    values, voxel = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
+    values, spacing = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
+    voxel = spacing
     tree = KDTree(points.double().numpy())
     finest = None
     while True:
@@ -160,7 +154,7 @@ def _merge_points(
         enough = hits >= rules.min_hits
         wanted = int(enough.sum())
         finest = wanted if finest is None else finest
-        if wanted <= rules.most or voxel > COARSEST * float(spacings.median()):
+        if wanted <= rules.most or voxel > COARSEST * spacing:
             break
         if rules.overflow == "none":
             return Spawned(FreeGaussians.empty(points), wanted)
@@ -172,17 +166,14 @@ def _merge_points(
     chosen = order[enough[order]][: rules.most].sort().values
     count = len(chosen)
     centers, looks, sizes = means[chosen].split([3, 3, 1], dim=1)
-    sizes = sizes * (voxel / float(spacings.median()))
-    unit = points.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.logit(torch.tensor(rules.opacity)).to(points)
+    sizes = sizes * (voxel / spacing)
     return Spawned(
-        FreeGaussians(
-            means=centers.contiguous(),
-            log_scales=(rules.size * sizes).log().expand(count, 3).contiguous(),
-            quats=unit.expand(count, 4).clone(),
-            logit_opacities=opacity.expand(count).clone(),
-            colors=looks.contiguous(),
-            births=first_identity + torch.arange(count, device=points.device),
+        FreeGaussians.spawned(
+            centers.contiguous(),
+            (rules.size * sizes).log().repeat(1, 3),
+            looks.contiguous(),
+            opacity=rules.opacity,
+            first_identity=first_identity,
         ),
         refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
         merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
@@ -262,7 +253,6 @@ class Sweep:
         floor: residuals of frame 0; None for none.
         rules: the rules.
         backend: the compute back-end.
-        known: by view index, what a sweep of the same Gaussians by other rules has drawn.
     """
 
     dynamic: Scene
@@ -272,16 +262,16 @@ class Sweep:
     floor: ResidualFloor | None
     rules: SpawnRules
     backend: Backend
-    known: Mapping[int, Missing] = field(default_factory=dict)
 
-    def missing(self, *, prunes: bool = True) -> list[Missing]:
+    def missing(self, *, prunes: bool = True, known: Sequence[Missing] = ()) -> list[Missing]:
         """Missing pixels of every view, none outside its active tiles.
 
         Args:
             prunes: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
+            known: what a sweep of the same Gaussians and views by other rules has drawn.
         """
         # The pictures are from before the second round: tiles without missing pixels then are assumed to have none.
-        found = self._before(wrong=prunes)
+        found = self._before(wrong=prunes, known=known)
         every = prunes and len(self.dynamic.free) > 0
         if not every and not self._enough(found):
             return found
@@ -309,16 +299,14 @@ class Sweep:
         """Whether enough views have missing pixels to spawn from."""
         return sum(entry.any for entry in missing) > self.rules.min_supports
 
-    def _before(self, *, wrong: bool) -> list[Missing]:
+    def _before(self, *, wrong: bool, known: Sequence[Missing]) -> list[Missing]:
         """By the pictures that are drawn already; ``wrong`` pixels make their tiles suspect, too."""
         views = list(self.views)
-        known = [self.known.get(view.index) for view in views]  # by the other rules
         actives = [self.active_tiles.get(view.index) for view in views]
         pictures = [None if active is None else active.picture for active in actives]
-        for n, entry in enumerate(known):
-            if pictures[n] is not None and entry is not None and entry.picture is not None:
-                pictures[n] = entry.picture
-        drawn = [None if entry is None else entry.drawn for entry in known]
+        drawn: list[Tensor | None] = [None] * len(views)
+        if known:
+            pictures, drawn = [entry.picture for entry in known], [entry.drawn for entry in known]
         residuals = self._residuals(views, pictures)
 
         def suspect_tiles(rows: list[int]) -> Sequence[TileSelection | None]:
@@ -491,9 +479,8 @@ def prune_and_spawn(
     if not config.enabled or not active_tiles:
         return none
     with torch.no_grad():
-        rules, eased = config.rules, floor
-        if floor is not None and config.CHANGED_FLOOR_MEDIANS is not None:
-            eased = floor.eased(split.selection.changed, medians=config.CHANGED_FLOOR_MEDIANS)
+        rules, medians = config.rules, config.CHANGED_FLOOR_MEDIANS
+        eased = None if floor is None else floor.eased(split.selection.changed, medians=medians)
         sweep = Sweep(dynamic, static, views, active_tiles, eased, rules, backend)
         missing = sweep.missing()
         if missing_share(missing) > rules.max_missing_share:
@@ -509,19 +496,13 @@ def prune_and_spawn(
         large = sweep.spawn(missing, first_identity=first_identity, room=room)
         if len(large.free) or not config.thin.enabled:
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
-        known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
-        thin_sweep = replace(sweep, floor=floor, rules=config.thin_rules, known=known)
-        thin = _spawn_thin(thin_sweep, first_identity=first_identity, room=room)
+        sweep = replace(sweep, floor=floor, rules=config.thin_rules)
+        missing = sweep.missing(prunes=False, known=missing)
+        if missing_share(missing) > sweep.rules.max_missing_share:
+            return replace(none, kept=kept)
+        thin = sweep.spawn(missing, first_identity=first_identity, room=room)
     return SpawnResult(kept, thin.free, len(thin.free), thin.refused_count)
-
-
-def _spawn_thin(sweep: Sweep, *, first_identity: int, room: int) -> Spawned:
-    """Spawn thin content, where nothing large is spawned."""
-    missing = sweep.missing(prunes=False)
-    if missing_share(missing) > sweep.rules.max_missing_share:
-        return Spawned(FreeGaussians.empty(sweep.dynamic.free.means))
-    return sweep.spawn(missing, first_identity=first_identity, room=room)
 
 
 def _outlier_mask(
