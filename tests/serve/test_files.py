@@ -82,22 +82,6 @@ def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
     assert count() == before
 
 
-def test_the_stamp_changes_when_a_file_grows_or_is_replaced(tmp_path: Path) -> None:
-    stamps = []
-    for step in range(3):
-        if step < 2:
-            with (tmp_path / "file").open("ab") as file:
-                file.write(b"x" * 10)
-        else:
-            (tmp_path / "other").write_bytes(b"y" * 20)
-            (tmp_path / "other").replace(tmp_path / "file")
-        opened = open_below(tmp_path, "file")
-        assert opened is not None
-        stamps.append(opened.stamp)
-        opened.close()
-    assert len(set(stamps)) == 3
-
-
 PLAIN = string.ascii_letters + string.digits + "._-"
 
 

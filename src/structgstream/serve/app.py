@@ -28,6 +28,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
@@ -40,7 +41,6 @@ from structgstream.serve.pages import SERVED_POLICY, bundle, linked_page, list_p
 from structgstream.serve.responses import NO_STORE_HEADERS, content_response, file_response
 from structgstream.serve.streams import (
     Catalog,
-    OpenedFile,
     ServedStream,
     StreamKind,
     hash_in_name,
@@ -298,7 +298,7 @@ def _check_plain(request: Request) -> None:
         raise Refused(404, _NOTHING_HERE)
 
 
-def _open_preview(stream: ServedStream) -> OpenedFile | None:
+def _open_preview(stream: ServedStream) -> FileBytes | None:
     for suffix in (".png", ".jpg"):
         segments = stream.segments[-1:]  # the best of several renditions
         opened = segments[0].open(f"preview{suffix}") if segments else stream.open_beside(f".preview{suffix}")
@@ -315,7 +315,7 @@ def _run_numbers(stream: ServedStream) -> dict[str, float]:
         return run_numbers(opened[:MAX_RUN_BYTES])
 
 
-async def _content(opened: OpenedFile | None, max_bytes: int) -> bytes | None:
+async def _content(opened: FileBytes | None, max_bytes: int) -> bytes | None:
     """The content of a small file; None if there is no file, or it is larger."""
     if opened is None:
         return None
