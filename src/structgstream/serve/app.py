@@ -12,6 +12,7 @@ docs/serve.md lists the addresses. The reverse proxy in front bounds connections
 """
 
 import asyncio
+import re
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
 from structgstream.errors import StreamError
-from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, query_of, refusal
+from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
 from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
@@ -56,6 +57,7 @@ METHODS: Final = ("GET", "HEAD", "OPTIONS")
 REQUEST_HEADERS: Final = ("Authorization", "Range", "If-Range", "If-None-Match")
 EXPOSED_HEADERS: Final = ("ETag", "Content-Range", "Content-Length", "Accept-Ranges")
 _PICTURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+_SEQUENCE: Final = re.compile(r"[0-9]{1,16}", re.ASCII)
 _NOTHING_HERE: Final = "There is nothing at this address."
 
 
@@ -248,7 +250,7 @@ class _Routes:
     async def _manifest(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "manifest")
         self._metrics.viewers.see(stream.name, request.scope.get("client"))
-        watch, after = self._manifests.watch(stream), query_of(request).after
+        watch, after = self._manifests.watch(stream), _after(request)
         if after is None or request.method == "HEAD":
             found = await watch.current()
         else:
@@ -296,6 +298,14 @@ def _check_plain(request: Request) -> None:
     """Check that the path consists of plain names."""
     if not is_plain_path(request.scope["raw_path"]):
         raise Refused(404, _NOTHING_HERE)
+
+
+def _after(request: Request) -> int | None:
+    """The sequence of the manifest that the client has; None if it does not wait for a newer one."""
+    given = request.query_params.get("after", "0")
+    if not _SEQUENCE.fullmatch(given):
+        raise Refused(400, "The query's after is not a sequence number.")
+    return int(given) if "after" in request.query_params else None
 
 
 def _open_preview(stream: ServedStream) -> FileBytes | None:
