@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.ray_cluster import CommandKilled, RayEngine, run_task
-from structgstream.executors.tasks import Task, TaskQueue
+from structgstream.executors import ray_cluster
+from structgstream.executors.ray_cluster import RayEngine, run_task
+from structgstream.executors.tasks import CommandProcess, Task, TaskQueue
 from tests.support.sleepers import all_endings
 
 
@@ -94,16 +95,16 @@ def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_list
     assert not folder.exists()
 
 
-def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRay) -> None:
+def test_few_tasks_are_in_flight_and_ray_does_not_repeat_them(ray: FakeRay) -> None:
     with TaskQueue(RayEngine(None, workers=2, cores=2)) as executor:
         for i in range(20):
-            executor.submit(Task(f"{i}", ("true",), log=Path("log.txt"), retries=3))
+            executor.submit(Task(f"{i}", ("true",), log=Path("log.txt")))
         endings = all_endings(executor)
     assert len(endings) == 20
     assert all(ending.done for ending in endings.values())
     assert ray.most == 4
     asked = ray.begun[0]
-    assert (asked["max_retries"], asked["retry_exceptions"], asked["num_cpus"]) == (3, [CommandKilled], 2)
+    assert (asked["max_retries"], asked["num_cpus"]) == (0, 2)
     assert asked["environment"]["OMP_NUM_THREADS"] == "2"
     assert asked["task"].log is None
     assert not Path("log.txt").exists()
@@ -112,11 +113,24 @@ def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRa
 def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
     ray.fails = {"bad"}
     with TaskQueue(RayEngine()) as executor:
-        executor.submit(Task("bad", ("true",)))
+        executor.submit(Task("bad", ("true",), retries=2))
         ending = all_endings(executor)["bad"]
-    assert ending.killed
+    assert (ending.killed, ending.attempts, len(ray.begun)) == (True, 3, 3)
     assert ending.output == "the machine is gone"
-    assert len(ray.begun) == 1
+
+
+@pytest.mark.parametrize("cancelled", [KeyboardInterrupt, SystemExit, RuntimeError])
+def test_a_cancelled_worker_leaves_no_command(monkeypatch: pytest.MonkeyPatch, cancelled: type[BaseException]) -> None:
+    seen: list[CommandProcess] = []
+
+    def cancel(processes: list[CommandProcess], seconds: float) -> bool:
+        seen.extend(processes)
+        raise cancelled
+
+    monkeypatch.setattr(ray_cluster, "waited_for", cancel)
+    with pytest.raises(cancelled):
+        run_task(Task("a", ("sleep", "60")), {})
+    assert not Path(f"/proc/{seen[0].pid}").exists()
 
 
 def test_closing_cancels_what_runs(ray: FakeRay) -> None:
@@ -189,5 +203,5 @@ def test_tasks_on_a_real_cluster_of_this_machine(tmp_path: Path) -> None:
     assert endings["first"] == [0, "1\n"]
     assert endings["python"][0] == endings["once"][0] == 0
     assert endings["bad"] == [3, "no power\n"]
-    assert endings["always"][0] == -1
+    assert endings["always"][0] == -9
     assert (tmp_path / "always").read_text() == "x\n" * 3

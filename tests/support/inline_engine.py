@@ -22,9 +22,6 @@ INTERRUPTED = 130
 class InlineEngine:
     """Runs ``{python} -m MODULE ...``."""
 
-    name = "inline"
-    repeats = False
-
     def __init__(self) -> None:
         self._next: Task | None = None
 

@@ -202,9 +202,6 @@ def tail_of(file: BinaryIO, begin: int) -> str:
 class LocalEngine:
     """Processes in slots: shares of the cores, or GPUs (``task.allocate_slots``)."""
 
-    name = "local"
-    repeats = False
-
     def __init__(self, slots: Sequence[WorkerSlot]) -> None:
         self._free = list(slots)
         self._has_gpu = any(slot.gpu is not None for slot in slots)
@@ -251,10 +248,7 @@ class LocalEngine:
 
 
 class Engine(Protocol):
-    """Runs tasks that are ready. ``repeats`` states whether it restarts killed tasks itself."""
-
-    name: str
-    repeats: bool
+    """Runs tasks that are ready, each once."""
 
     def check(self, gpus: int) -> None:
         """Raises ConfigError if a task that needs ``gpus`` GPUs would never run."""
@@ -321,12 +315,11 @@ class TaskQueue:
         for result in self.engine.ended(seconds):
             self._running.remove(result.name)
             task, _ = self._tasks[result.name]
-            if result.killed and not self.engine.repeats and self._attempts[result.name] <= task.retries:
+            if result.killed and self._attempts[result.name] <= task.retries:
                 self._ready.appendleft(result.name)
                 continue
             del self._tasks[result.name]
-            attempts = self._attempts.pop(result.name)
-            results.append(result if self.engine.repeats else replace(result, attempts=attempts))
+            results.append(replace(result, attempts=self._attempts.pop(result.name)))
         self._begin()
         return results
 
