@@ -188,9 +188,7 @@ def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path, monkeypatch:
     """It may hold credentials, and every user of a machine sees command lines."""
     url = f"file://{tmp_path / 'secret'}"
     parts = Parts(tmp_path / "a.parts")
-    unit = Unit("capture")
-    exchange = ObjectStore(ObjectFolder(url), parts, cut=unit.cut)
-    task = exchange.header(unit.header_task(parts))
+    task = ObjectStore(ObjectFolder(url), parts).header(Unit("capture").header_task(parts))
     assert not any("secret" in word for word in task.command)
     assert task.environment[staged.STORE] == url
     monkeypatch.delenv(staged.STORE, raising=False)
