@@ -2,6 +2,7 @@
 """Addresses, options, and sockets of a server."""
 
 import asyncio
+import os
 import socket
 import webbrowser
 
@@ -112,9 +113,11 @@ def test_a_port_that_cannot_be_used_is_one_sentence(port: int | str) -> None:
 def test_a_browser_needs_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
-    assert not open_browser("http://here/", environ={})
-    assert not open_browser("http://here/", environ={"DISPLAY": "", "TERM": "xterm"})
+    for environ in ({}, {"DISPLAY": "", "TERM": "xterm"}):
+        monkeypatch.setattr(os, "environ", environ)
+        assert not open_browser("http://here/")
     assert not opened
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
-        assert open_browser("http://here/", environ={name: ":0"})
+        monkeypatch.setattr(os, "environ", {name: ":0"})
+        assert open_browser("http://here/")
     assert opened == ["http://here/"] * 3
