@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from structgstream.errors import ConfigError, OutOfMemoryError
+from structgstream.errors import OutOfMemoryError
 from structgstream.groups import unit as method
 from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.unit import (
@@ -82,11 +82,6 @@ def task(index: int) -> Any:
     return SimpleNamespace(
         frame=frame, pictures=pictures, backend=backend, seed=3, steps={}, on_step=None, pressure=0.0
     )
-
-
-def test_frame_0_is_the_headers() -> None:
-    with pytest.raises(ConfigError, match="a header with frame 0; give one with --init"):
-        group().first(task(0))
 
 
 def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual) -> None:

@@ -79,13 +79,6 @@ def test_the_segment_of_frame_0_begins_with_it(tmp_path: Path) -> None:
     assert (found.complete, found.record(0)) == (True, base().first)
 
 
-def test_a_group_has_no_other_period(tmp_path: Path) -> None:
-    sink = SegmentSink(tmp_path / "g.sgs", base(), IDENTITY, None)
-    with pytest.raises(ConfigError, match="cannot begin another period; leave out --period"):
-        sink.begin(base().header)
-    sink.close()
-
-
 @examples(80)
 @given(st.data())
 def test_cut_and_flipped_anywhere_it_goes_on_to_the_same_bytes(

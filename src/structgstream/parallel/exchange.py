@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
-from structgstream.errors import ConfigError, StorageError, StructGStreamError
+from structgstream.errors import StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
 from structgstream.executors.tasks import PYTHON, Task, tied_argv
 from structgstream.groups.track_file import groups_path, open_track, track_bytes
@@ -282,9 +282,7 @@ class Staging:
 
 def run(transfer: Transfer, command: Sequence[str]) -> int:
     """Fetches inputs, runs the command and stores outputs; returns its status."""
-    url = os.environ.get(STORE)
-    if not url:
-        raise ConfigError(f"The variable {STORE} has no URL of a store.")
+    url = os.environ[STORE]
     staging = Staging(ObjectFolder(url), scratch_folder(transfer, url))
     for name in transfer.needs:
         staging.fetch(name, replace=True)
