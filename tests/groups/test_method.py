@@ -105,15 +105,6 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
     assert second.state is SCENE
 
 
-def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
-    made = group(first=None)
-    past: Past[Any, Any] = Past(SCENE, FrameZeroContext())
-    for index in (1, 2):
-        made.next(past, task(index))
-    assert usual.asked == [("next", past)] * 2
-    assert usual.thin == ["none"] * 2
-
-
 def test_the_first_frames_catch_up(usual: Usual) -> None:
     made = group()
     for index in range(FIRST, FIRST + CATCH_UP_FRAMES + 2):

@@ -102,16 +102,6 @@ def test_a_run_that_was_begun_anew_finds_nothing_of_the_one_before(store: Object
     assert scratch(tmp_path) == [mine], "a folder without a marker stays"
 
 
-def test_an_earlier_attempt_here_is_not_replaced_by_the_store(staging: Staging) -> None:
-    staging.store.write("a", b"store")
-    staging.fetch("a")
-    assert (staging.folder / "a").read_bytes() == b"store"
-    (staging.folder / "a").write_bytes(b"further")
-    staging.fetch("a")
-    assert (staging.folder / "a").read_bytes() == b"further"
-    assert [path.name for path in staging.folder.iterdir()] == ["a"]
-
-
 def test_a_result_of_before_is_brought_to_be_checked(store: ObjectFolder) -> None:
     store.write("b", b"before\n")
     assert run(store, 'grep -q before "$0/b"', "--gives", "b") == 0
