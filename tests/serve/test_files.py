@@ -126,13 +126,6 @@ def test_a_name_of_a_stream_is_one_part_of_an_address_as_it_stands(name: str) ->
         assert not name.startswith(".")
 
 
-@given(st.lists(st.text(PLAIN, max_size=4), max_size=5))
-@examples(400)
-def test_a_plain_path_never_leads_up(parts: list[str]) -> None:
-    path = "/" + "/".join(parts)
-    assert is_plain_path(path.encode()) == (not {".", ".."} & set(parts))
-
-
 @given(st.integers(0, 2**32 - 1), st.binary(max_size=4))
 @examples(200)
 def test_the_hash_is_found_in_every_name_that_a_writer_gives(number: int, data: bytes) -> None:

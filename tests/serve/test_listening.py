@@ -10,7 +10,6 @@ import pytest
 
 from structgstream.errors import ConfigError, PlayerError
 from structgstream.serve.listening import (
-    LOOPBACK,
     LOOPBACK_NAMES,
     accepted_hosts,
     bound,
@@ -73,12 +72,6 @@ def test_a_connection_keeps_little_for_a_slow_client(address: str) -> None:
         accepted, _ = listening.accept()
         with accepted:
             assert accepted.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 2**20
-
-
-def test_a_connection_is_accepted_before_the_server_runs() -> None:
-    with bound(0) as listening, socket.create_connection((LOOPBACK, listening.getsockname()[1]), timeout=5) as client:
-        assert client.getpeername()[0] == LOOPBACK
-        assert listening.getsockname()[0] == LOOPBACK
 
 
 def test_responses_of_a_connection_are_not_delayed() -> None:

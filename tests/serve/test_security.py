@@ -167,15 +167,6 @@ def test_long_headers_are_refused(server: Served) -> None:
     assert not answer or status_of(answer) in (400, 431)
 
 
-@pytest.mark.parametrize(
-    "sent", [b"\x16\x03\x01\x02\x00\x01", b"GET / HTTP/9.9\r\n\r\n", b"GET /\x00 HTTP/1.1\r\n\r\n"]
-)
-def test_what_is_no_http_is_refused(server: Served, sent: bytes) -> None:
-    answer = answer_to(server, sent + b"\r\n\r\n")
-    assert not answer or status_of(answer) == 400
-    assert server.ask("/health").status == 200
-
-
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "TRACE", "CONNECT", "PROPFIND", "OPTIONS"])
 def test_nothing_can_be_changed(server: Served, method: str) -> None:
     answer = server.ask("/streams/studio/manifest.json", method=method)

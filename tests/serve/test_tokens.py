@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from starlette.requests import Request
 
 from structgstream.errors import ConfigError
 from structgstream.serve import access as tokens
-from structgstream.serve.access import EVERY_STREAM, Access, TokenKeys, read_keys
+from structgstream.serve.access import EVERY_STREAM, Access, TokenKeys, read_keys, token_of
 from structgstream.serve.app import ServerSettings
 from tests.support.segment_folders import GrowingFolder
 from tests.support.serving import Served, hosted
@@ -133,10 +134,12 @@ def everything(tmp_path: Path) -> list[str]:
 
 
 def test_nothing_is_shown_without_a_token(server: Served, tmp_path: Path) -> None:
+    missing, forged = b"An access token is needed here.", b"The access token is not one of this server."
+    queries = {"": missing, "?token=": missing, "?token=v1.9999999999.x.studio": forged, f"?token={TOKEN[:-1]}": forged}
     for address in (*everything(tmp_path), "/", "/streams.json", "/metrics", "/streams/nobody/", "/streams/nobody/x"):
-        for query in ("", "?token=", "?token=v1.9999999999.x.studio", f"?token={TOKEN[:-1]}"):
+        for query, words in queries.items():
             answer = server.ask(address + query)
-            assert answer.status == 401, address
+            assert (answer.status, answer.body) == (401, words), address
             assert answer.headers["www-authenticate"].startswith("Bearer")
             assert answer.headers["cache-control"] == "no-store"
     assert server.ask("/health").status == 200
@@ -152,11 +155,23 @@ def test_a_token_in_the_query_or_the_header(server: Served, tmp_path: Path) -> N
         assert server.ask(address, Authorization=f"Basic {TOKEN}").status == 401
 
 
+def test_the_header_comes_before_the_query() -> None:
+    def found(authorization: str) -> str | None:
+        headers = [(b"authorization", authorization.encode())]
+        return token_of(Request({"type": "http", "headers": headers, "query_string": b"token=one"}))
+
+    assert found("Bearer two.~+/-_==") == "two.~+/-_=="
+    assert found("bEARER   two") == "two"
+    for other in ("Basic two", "Bearer", "Bearer two three", "Bearer two\n", "Bearer =", "Bearertwo"):
+        assert found(other) == "one", other
+
+
 def test_a_token_of_another_stream_and_one_that_expired(server: Served, tmp_path: Path) -> None:
     other = KEYS.token("ball.sgs", expires_unix_seconds=int(NOW) + 60)
     old = KEYS.token("studio", expires_unix_seconds=int(NOW))
     for address in everything(tmp_path):
-        assert server.ask(f"{address}?token={other}").status == 403
+        refused = server.ask(f"{address}?token={other}")
+        assert (refused.status, refused.body) == (403, b"The access token is for another stream.")
         expired = server.ask(f"{address}?token={old}")
         assert (expired.status, expired.body) == (401, b"The access token has expired.")
     # It does not say which streams there are, either.
