@@ -15,9 +15,6 @@ from typing import IO
 
 from structgstream.executors.tasks import Task, TaskResult, opened_log, tail_of
 
-INTERRUPTED = 130
-"""Exit status of a command that was ended by Ctrl-C."""
-
 
 class InlineEngine:
     """Runs ``{python} -m MODULE ...``."""
@@ -51,11 +48,7 @@ class InlineEngine:
 
 
 def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> tuple[int, str]:
-    """Runs a module as a program; returns its exit status and the end of its output.
-
-    Raises:
-        KeyboardInterrupt: the user pressed Ctrl-C, also if the program handled it and ended.
-    """
+    """Runs a module as a program; returns its exit status and the end of its output."""
     with opened_log(log) as file:
         began_at = file.tell()
         with io.TextIOWrapper(file, write_through=True) as text:
@@ -71,8 +64,6 @@ def _status_of(module: str) -> int:
             warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")
             runpy.run_module(module, run_name="__main__", alter_sys=True)
     except SystemExit as error:
-        if error.code == INTERRUPTED:
-            raise KeyboardInterrupt from None
         if isinstance(error.code, str):
             print(error.code, file=sys.stderr)
         return 0 if error.code is None else error.code if isinstance(error.code, int) else 1
