@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig, enlargement
+from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
@@ -188,7 +188,7 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
     primitives = primitive_of(gaussians, scene)
     sums = accumulate(gaussians, small.camera, maps, backend)
-    sums *= _pixel_area(view, size)
+    sums *= view.reference_area / (size[0] * size[1])  # in pixels of the reference size
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.MIN_CHANGED_PIXELS) & (changed > motion.MIN_CHANGED_SHARE * total)
@@ -235,7 +235,7 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps.to(inside.device), inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
-    sums *= _pixel_area(view, size)
+    sums *= view.reference_area / (size[0] * size[1])  # in pixels of the reference size
     return sum_by_primitive(sums, seen.primitives, scene)
 
 
@@ -245,12 +245,6 @@ def _coverage(seen: Sequence[_ViewEvidence], scene: Scene) -> Tensor:
     for entry in seen:
         found[entry.gaussians.ids] += entry.coverage
     return found
-
-
-def _pixel_area(view: View, size: tuple[int, int]) -> float:
-    """Pixels of the stream's pictures at the reference size, the unit of thresholds, per pixel of the maps."""
-    width, height = view.camera.width, view.camera.height
-    return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
 
 
 def _counted_pixels(tiles: TileSelection, view: View) -> Tensor:

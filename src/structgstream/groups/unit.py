@@ -8,7 +8,6 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -262,12 +261,8 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
     least = MIN_DISPLACED_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
-
-    @cache
-    def first_pictures() -> MultiViewFrame:
-        return next(denoised(source, base.config.denoising).frames(0))
-
-    return GroupEntry(start.frame, displacements, velocities, first_pictures)
+    pictures = denoised(source, base.config.denoising)
+    return GroupEntry(start.frame, displacements, velocities, lambda: next(pictures.frames(0)))
 
 
 def _remove(path: Path) -> None:
