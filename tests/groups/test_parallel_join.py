@@ -13,10 +13,9 @@ from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.tasks import PYTHON, Task
 from structgstream.groups import join, seam_blend
 from structgstream.groups.base import GroupBase, open_for
-from structgstream.groups.join import MAX_GROUPS, PURPOSE, join_segments, runs_of
+from structgstream.groups.join import MAX_GROUPS, join_segments, runs_of
 from structgstream.groups.seam_blend import FADE_FRAMES, OWN_FRAMES, Border
 from structgstream.groups.track_pass import track_capture
-from structgstream.owned_folders import own_folder
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
 from tests.support.inline_engine import InlineEngine
@@ -57,9 +56,6 @@ def fading_in_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_give_the_bytes_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(join, "LocalEngine", lambda slots: InlineEngine())
     found = []
-    left = tmp_path / "2.sgs.runs" / "run-0"  # By one that was killed.
-    own_folder(left.parent, PURPOSE)
-    left.write_bytes(b"half")
     for workers in (1, 2):
         path, borders = tmp_path / f"{workers}.sgs", list[Border]()
         backend = quickest_backend()
