@@ -116,6 +116,7 @@ class _Routes:
         self._clock = clock
         self._wait_seconds = settings.wait_seconds
         self._visibility = "public" if settings.keys is None else "private"
+        self._revalidated = "no-cache" if settings.keys is None else "private, no-cache"  # content that changes
         shared = "cross-origin" if settings.origins else "same-origin"
         self._headers = {**NO_STORE_HEADERS, "Cross-Origin-Resource-Policy": shared}
         self._module = bundle()
@@ -241,11 +242,6 @@ class _Routes:
         content = _found(await _content(await to_thread.run_sync(stream.open, QUALITIES), MAX_LIST_BYTES), stream)
         headers = {**self._headers, "Cache-Control": self._revalidated}
         return content_response(content, request, headers, media_type="application/json")
-
-    @property
-    def _revalidated(self) -> str:
-        """``Cache-Control`` of content that changes."""
-        return "no-cache" if self._visibility == "public" else "private, no-cache"
 
     async def _manifest(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "manifest")
