@@ -177,27 +177,28 @@ def test_an_old_ray_or_none_is_reported(ray: FakeRay, monkeypatch: pytest.Monkey
 
 
 REAL = """
-import json, os
+import json, sys
 from structgstream.executors.ray_cluster import RayEngine
 from structgstream.executors.tasks import PYTHON, Task, TaskQueue
 from tests.support.sleepers import all_endings
+folder = sys.argv[1]
 with TaskQueue(RayEngine(None, workers=2)) as executor:
     executor.submit(Task("first", ("sh", "-c", "echo $OMP_NUM_THREADS")))
     executor.submit(Task("python", (PYTHON, "-m", "this")))
     executor.submit(Task("bad", ("sh", "-c", "echo no power; exit 3")))
-    executor.submit(Task("once", ("sh", "-c", "test -e {0}/once || {{ touch {0}/once; kill -9 $$; }}".format({1!r}))))
-    executor.submit(Task("always", ("sh", "-c", "echo x >> {0}/always; kill -9 $$".format({1!r})), retries=2))
+    executor.submit(Task("once", ("sh", "-c", 'test -e "$0/once" || { touch "$0/once"; kill -9 $$; }', folder)))
+    executor.submit(Task("always", ("sh", "-c", 'echo x >> "$0/always"; kill -9 $$', folder), retries=2))
     endings = all_endings(executor)
-print(json.dumps({{name: [ending.status, ending.output[:40]] for name, ending in endings.items()}}))
+print(json.dumps({name: [ending.status, ending.output[:40]] for name, ending in endings.items()}))
 """
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray, of the extra cluster, is not installed")
 def test_tasks_on_a_real_cluster_of_this_machine(tmp_path: Path) -> None:
-    code = REAL.replace("{0}", str(tmp_path)).replace(".format({1!r})", "").replace("{{", "{").replace("}}", "}")
     path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    command = [sys.executable, "-c", REAL, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     endings = json.loads(done.stdout.splitlines()[-1])
     assert endings["first"] == [0, "1\n"]
