@@ -25,14 +25,6 @@ def content(folder: Path, *parts: str) -> bytes | None:
         return opened[:]
 
 
-def test_a_file_at_any_depth(tmp_path: Path) -> None:
-    (tmp_path / "a" / "b").mkdir(parents=True)
-    (tmp_path / "a" / "b" / "file").write_bytes(b"deep")
-    (tmp_path / "file").write_bytes(b"shallow")
-    assert content(tmp_path, "a", "b", "file") == b"deep"
-    assert content(tmp_path, "file") == b"shallow"
-
-
 def test_nothing_that_is_no_file_is_opened(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"x")

@@ -142,14 +142,6 @@ def test_no_link_is_followed(own_server: Served, folder: Path) -> None:
     assert own_server.ask("/streams/ball.sgs/stream.sgs").status == 404
 
 
-def test_a_pipe_is_no_file_and_nobody_waits_for_it(own_server: Served, folder: Path) -> None:
-    pipe = "part-00000098-0123456789abcdef.sgs"
-    os.mkfifo(folder / "studio" / pipe)
-    (folder / "studio" / "part-00000097-0123456789abcdef.sgs").mkdir()
-    assert own_server.ask(f"/streams/studio/{pipe}").status == 404
-    assert own_server.ask("/streams/studio/part-00000097-0123456789abcdef.sgs").status == 404
-
-
 def test_queries_have_a_sequence_number_or_what_does_not_matter(server: Served) -> None:
     numbers = ("", "-1", "1.0", "1e3", "x", "%31%0a", "1_0", "9" * 17, "%D9%A1", "\u0663")
     queries = [(f"after={number}", 400) for number in numbers]

@@ -67,14 +67,10 @@ class TaskResult:
         return self.status < 0
 
 
-def argv_of(command: tuple[str, ...]) -> list[str]:
-    """The argument vector on this machine."""
-    return [sys.executable if word == PYTHON and not i else word for i, word in enumerate(command)]
-
-
 def tied_argv(command: tuple[str, ...]) -> list[str]:
-    """As :func:`argv_of`, of a process that is killed when this one ends (``launch.py``)."""
-    return [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid()), *argv_of(command)]
+    """The argument vector on this machine of a process that is killed when this one ends (``launch.py``)."""
+    first = sys.executable if command[0] == PYTHON else command[0]
+    return [sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), first, *command[1:]]
 
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

@@ -199,7 +199,7 @@ def _stream(root: Path, entry: "os.DirEntry[str]") -> ServedStream | None:
 
 def _in_folder(root: Path, name: str) -> ServedStream | None:
     """The stream that is the folder ``name``: of segments, or of renditions as soon as all have a manifest."""
-    if _has_manifest(root / name):
+    if _opens(root, name, MANIFEST):
         return ServedStream(root, name, StreamKind.SEGMENTS)
     try:
         folders = _renditions(root, name)
@@ -224,10 +224,3 @@ def _opens(root: Path, *parts: str) -> bool:
     if opened is not None:
         opened.close()
     return opened is not None
-
-
-def _has_manifest(folder: Path) -> bool:
-    try:
-        return stat.S_ISREG((folder / MANIFEST).lstat().st_mode)
-    except OSError:
-        return False
