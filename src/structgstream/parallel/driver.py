@@ -163,15 +163,13 @@ class _Drive:
         self._executor.submit(self._exchange.track(self._unit.track_task(parts)), gpus=gpus)
         is_tracked = is_lost = False
         while not is_tracked or self._executor.running or self._executor.waiting:
-            if not is_lost:
-                self._submit_groups(is_tracked=is_tracked)
             for result in self._executor.wait(POLL_SECONDS):
                 is_tracked |= result.name == TRACK
                 is_lost |= result.name == TRACK and not result.done
                 self._record(result)
-            if is_tracked and not is_lost:
-                self._submit_groups(is_tracked=True)
-                if not self._groups:
+            if not is_lost:
+                self._submit_groups(is_tracked=is_tracked)
+                if is_tracked and not self._groups:
                     raise TaskError(f"The tracking pass has ended, and there are no groups next to {parts.track}.")
             self._states |= {name: State.RUNNING for name in self._executor.running if name in self._states}
             self._show()
