@@ -8,10 +8,10 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import IO
+from unittest.mock import patch
 
 from structgstream.executors.tasks import Task, TaskResult, opened_log, tail_of
 
@@ -52,7 +52,12 @@ def _called(module: str, arguments: list[str], environment: Mapping[str, str], *
     with opened_log(log) as file:
         began_at = file.tell()
         with io.TextIOWrapper(file, write_through=True) as text:
-            with _printing(text), _as_program(module, arguments, environment):
+            with (
+                redirect_stdout(text),
+                redirect_stderr(text),
+                patch.object(sys, "argv", [module, *arguments]),
+                patch.dict(os.environ, environment),
+            ):
                 status = _status_of(module)
             return status, tail_of(file, began_at)
 
@@ -71,27 +76,3 @@ def _status_of(module: str) -> int:
         traceback.print_exc()
         return 1
     return 0
-
-
-@contextmanager
-def _as_program(module: str, arguments: list[str], environment: Mapping[str, str]) -> Iterator[None]:
-    """Sets the arguments and variables of a separate process, and restores them afterwards."""
-    given, before = sys.argv, dict(os.environ)
-    sys.argv = [module, *arguments]
-    os.environ.update(environment)
-    try:
-        yield
-    finally:
-        sys.argv = given
-        for name in environment:
-            if name in before:
-                os.environ[name] = before[name]
-            else:
-                os.environ.pop(name, None)
-
-
-@contextmanager
-def _printing(text: IO[str]) -> Iterator[None]:
-    """Redirects the output of the block to ``text``."""
-    with redirect_stdout(text), redirect_stderr(text):
-        yield

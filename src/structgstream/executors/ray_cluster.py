@@ -11,7 +11,6 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +49,9 @@ class RayEngine:
         except ConfigError:
             self._folder.cleanup()
             raise
+        self._remote = self._ray.remote(run_task)
         self._pending: dict[Any, tuple[str, float]] = {}
         self._counted = (-COUNT_SECONDS, 0)
-
-    @cached_property
-    def _remote(self) -> Any:
-        return self._ray.remote(run_task)
 
     def check(self, gpus: int) -> None:
         """See ``Engine.check``; the cluster may get GPUs later."""

@@ -177,7 +177,7 @@ class _Drive:
             raise TaskError(_sentence(self._failed, parts))
         return self._join()
 
-    def _alone(self, queue: TaskQueue, task: Task, *, gpus: int = 0) -> TaskResult:
+    def _alone(self, queue: TaskQueue, task: Task, *, gpus: int) -> TaskResult:
         """Runs a task that all others depend on, or that depends on them."""
         self._show()
         queue.submit(task, gpus=gpus)
