@@ -13,13 +13,6 @@ from structgstream.parallel.exchange import ObjectFolder
 from structgstream.remote_folders import open_url, reason_of, shown_address, without_secrets
 
 
-def test_a_url_is_a_folder(tmp_path: Path) -> None:
-    files, root = open_url(f"file://{tmp_path}")
-    assert Path(root) == tmp_path
-    files.pipe_file(f"{root}/a", b"content")
-    assert (tmp_path / "a").read_bytes() == b"content"
-
-
 def test_what_is_no_url_is_reported() -> None:
     with pytest.raises(StorageError, match=r"^nonsense://a cannot be used as a store \(.*nonsense"):
         open_url("nonsense://a")

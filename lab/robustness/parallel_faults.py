@@ -64,7 +64,7 @@ def job_in(folder: Path, *, real: bool) -> Job:
         )
     else:
         track = ("--groups", "4")
-        unit = Unit("capture", 80, track=track, program=STAND_IN, starts=stand_in.starts, cut=stand_in.cut)
+        unit = Unit("capture", 80, track=track, program=STAND_IN)
     return Job(unit, folder / "out.sgs")
 
 
@@ -77,7 +77,7 @@ def driven(folder: Path, engine: LocalEngine, *, real: bool, url: str | None = N
     """
     given, parts = job_in(folder, real=real), Parts(folder / "parts")
     with parts.locked(), TaskQueue(engine) as executor:
-        exchange = None if url is None else ObjectStore(ObjectFolder(url), parts, cut=given.unit.cut)
+        exchange = None if url is None else ObjectStore(ObjectFolder(url), parts)
         drive(given, parts, executor, exchange=exchange)
     return hashlib.sha256(given.output.read_bytes()).hexdigest()
 

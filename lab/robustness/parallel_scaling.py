@@ -155,7 +155,7 @@ def planned(row: str, folder: Path) -> dict[str, object]:
     folder.mkdir(parents=True)
     os.environ["STAND_IN_SECONDS"] = "0.001"
     program = (PYTHON, "-I", "-S", stand_in.__file__)
-    unit = Unit("capture", PLANNED, track=("--groups", "1"), program=program, starts=stand_in.starts)
+    unit = Unit("capture", PLANNED, track=("--groups", "1"), program=program)
     parts, begun, seen = Parts(folder / "parts"), time.monotonic(), list[float]()
 
     def tell(status: Status) -> None:

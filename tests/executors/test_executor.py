@@ -12,8 +12,6 @@ from structgstream.executors.tasks import Task, TaskQueue, TaskResult
 class Scripted:
     """An engine of ``room`` slots; tasks end in the order of a seed, with the statuses that are given for them."""
 
-    name, repeats = "scripted", False
-
     def __init__(self, room: int, statuses: dict[str, list[int]] | None = None, *, seed: int = 0) -> None:
         self._room, self._random, self._statuses = room, random.Random(seed), statuses or {}
         self._running: list[tuple[str, int]] = []

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor that a caller names, with as many slots as it asks for."""
 
-import sys
 from typing import Any
 
 import pytest
 
-from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.errors import ConfigError
 from structgstream.executors import ray_cluster
 from structgstream.executors import tasks as opening
-from structgstream.executors.tasks import ExecutorName, ExecutorOptions, Task, WorkerSlot, open_executor
-from tests.support.sleepers import all_endings
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions, WorkerSlot, open_executor
 
 
 @pytest.fixture
@@ -68,12 +66,3 @@ def test_less_than_one_is_refused_whatever_runs(
     with pytest.raises(ConfigError, match=f"The number of {said}"):
         open_and_close(ExecutorOptions(name, workers, threads), cores=4)
     assert not opened
-
-
-def test_without_ray_the_others_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match="cluster"):
-        open_executor(ExecutorOptions("ray"), cores=1)
-    with open_executor(ExecutorOptions("local"), cores=1) as executor:
-        executor.submit(Task("task", ("true",)))
-        assert all_endings(executor)["task"].done

@@ -3,7 +3,6 @@
 
 import os
 import signal
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -13,18 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.executors import tasks as process
-from structgstream.executors.tasks import (
-    PYTHON,
-    TAIL_BYTES,
-    CommandProcess,
-    Task,
-    TaskResult,
-    opened_log,
-    tail_of,
-    waited_for,
-)
+from structgstream.executors.tasks import TAIL_BYTES, CommandProcess, Task, TaskResult, tail_of, waited_for
 from tests.support.properties import examples
-from tests.support.sleepers import PATIENCE_SECONDS
+from tests.support.sleepers import PATIENCE_SECONDS, is_gone, wait_for
 
 
 def begun(*command: str, log: Path | None = None, **variables: str) -> CommandProcess:
@@ -61,11 +51,6 @@ def test_nothing_comes_in_and_the_tasks_own_variables_come_last() -> None:
     assert ending.output == f"task slot {os.environ['HOME']}\n"
 
 
-def test_python_is_the_interpreter_here() -> None:
-    ending = ending_of(begun(PYTHON, "-c", "import sys; print(sys.executable)"))
-    assert ending.output == f"{sys.executable}\n"
-
-
 def test_its_descriptor_is_closed_when_it_has_ended() -> None:
     running = begun("true")
     ending_of(running)
@@ -75,24 +60,13 @@ def test_its_descriptor_is_closed_when_it_has_ended() -> None:
 
 def test_what_it_leaves_behind_ends_with_it() -> None:
     ending = ending_of(begun("sh", "-c", "sleep 60 & echo $!"))
-    pid = int(ending.output)
-    end = time.monotonic() + PATIENCE_SECONDS
-    while alive(pid):
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+    assert is_gone(int(ending.output))
 
 
 def test_asked_it_may_end_by_itself(tmp_path: Path) -> None:
     log = tmp_path / "log"
     running = begun("sh", "-c", "trap 'echo bye; exit 7' TERM; echo ready; while :; do sleep 0.01; done", log=log)
-    wait_for(log, "ready\n")
+    wait_for(log)
     running.ask()
     ending = ending_of(running)
     assert ending.status == 7
@@ -103,16 +77,9 @@ def test_one_that_does_not_listen_is_killed(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(process, "ENDING_SECONDS", 0.2)
     log = tmp_path / "log"
     running = begun("sh", "-c", "trap '' TERM; echo ready; while :; do sleep 0.01; done", log=log)
-    wait_for(log, "ready\n")
+    wait_for(log)
     running.stop()
-    assert not alive(running.pid)
-
-
-def wait_for(path: Path, text: str) -> None:
-    end = time.monotonic() + PATIENCE_SECONDS
-    while not (path.exists() and path.read_text() == text):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    assert is_gone(running.pid)
 
 
 def test_the_first_of_several_is_waited_for() -> None:
@@ -121,15 +88,6 @@ def test_the_first_of_several_is_waited_for() -> None:
     assert slow.ended() is None
     assert ending_of(quick).done
     slow.stop()
-
-
-def test_a_log_is_made_with_its_folder_and_gone_on_with(tmp_path: Path) -> None:
-    log = tmp_path / "logs" / "deep" / "a.txt"
-    for number in range(2):
-        assert ending_of(begun("echo", str(number), log=log)).output == f"{number}\n"
-    assert log.read_text() == "0\n1\n"
-    with opened_log(log) as file:
-        assert file.tell() == 4
 
 
 def test_what_is_no_text_is_no_error() -> None:

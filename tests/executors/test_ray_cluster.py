@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.ray_cluster import CommandKilled, RayEngine, run_task
-from structgstream.executors.tasks import Task, TaskQueue
+from structgstream.executors import ray_cluster
+from structgstream.executors.ray_cluster import RayEngine, run_task
+from structgstream.executors.tasks import CommandProcess, Task, TaskQueue
 from tests.support.sleepers import all_endings
 
 
@@ -94,16 +95,16 @@ def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_list
     assert not folder.exists()
 
 
-def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRay) -> None:
+def test_few_tasks_are_in_flight_and_ray_does_not_repeat_them(ray: FakeRay) -> None:
     with TaskQueue(RayEngine(None, workers=2, cores=2)) as executor:
         for i in range(20):
-            executor.submit(Task(f"{i}", ("true",), log=Path("log.txt"), retries=3))
+            executor.submit(Task(f"{i}", ("true",), log=Path("log.txt")))
         endings = all_endings(executor)
     assert len(endings) == 20
     assert all(ending.done for ending in endings.values())
     assert ray.most == 4
     asked = ray.begun[0]
-    assert (asked["max_retries"], asked["retry_exceptions"], asked["num_cpus"]) == (3, [CommandKilled], 2)
+    assert (asked["max_retries"], asked["num_cpus"]) == (0, 2)
     assert asked["environment"]["OMP_NUM_THREADS"] == "2"
     assert asked["task"].log is None
     assert not Path("log.txt").exists()
@@ -112,11 +113,24 @@ def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRa
 def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
     ray.fails = {"bad"}
     with TaskQueue(RayEngine()) as executor:
-        executor.submit(Task("bad", ("true",)))
+        executor.submit(Task("bad", ("true",), retries=2))
         ending = all_endings(executor)["bad"]
-    assert ending.killed
+    assert (ending.killed, ending.attempts, len(ray.begun)) == (True, 3, 3)
     assert ending.output == "the machine is gone"
-    assert len(ray.begun) == 1
+
+
+@pytest.mark.parametrize("cancelled", [KeyboardInterrupt, SystemExit, RuntimeError])
+def test_a_cancelled_worker_leaves_no_command(monkeypatch: pytest.MonkeyPatch, cancelled: type[BaseException]) -> None:
+    seen: list[CommandProcess] = []
+
+    def cancel(processes: list[CommandProcess], seconds: float) -> bool:
+        seen.extend(processes)
+        raise cancelled
+
+    monkeypatch.setattr(ray_cluster, "waited_for", cancel)
+    with pytest.raises(cancelled):
+        run_task(Task("a", ("sleep", "60")), {})
+    assert not Path(f"/proc/{seen[0].pid}").exists()
 
 
 def test_closing_cancels_what_runs(ray: FakeRay) -> None:
@@ -163,31 +177,32 @@ def test_an_old_ray_or_none_is_reported(ray: FakeRay, monkeypatch: pytest.Monkey
 
 
 REAL = """
-import json, os
+import json, sys
 from structgstream.executors.ray_cluster import RayEngine
 from structgstream.executors.tasks import PYTHON, Task, TaskQueue
 from tests.support.sleepers import all_endings
+folder = sys.argv[1]
 with TaskQueue(RayEngine(None, workers=2)) as executor:
     executor.submit(Task("first", ("sh", "-c", "echo $OMP_NUM_THREADS")))
     executor.submit(Task("python", (PYTHON, "-m", "this")))
     executor.submit(Task("bad", ("sh", "-c", "echo no power; exit 3")))
-    executor.submit(Task("once", ("sh", "-c", "test -e {0}/once || {{ touch {0}/once; kill -9 $$; }}".format({1!r}))))
-    executor.submit(Task("always", ("sh", "-c", "echo x >> {0}/always; kill -9 $$".format({1!r})), retries=2))
+    executor.submit(Task("once", ("sh", "-c", 'test -e "$0/once" || { touch "$0/once"; kill -9 $$; }', folder)))
+    executor.submit(Task("always", ("sh", "-c", 'echo x >> "$0/always"; kill -9 $$', folder), retries=2))
     endings = all_endings(executor)
-print(json.dumps({{name: [ending.status, ending.output[:40]] for name, ending in endings.items()}}))
+print(json.dumps({name: [ending.status, ending.output[:40]] for name, ending in endings.items()}))
 """
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray, of the extra cluster, is not installed")
 def test_tasks_on_a_real_cluster_of_this_machine(tmp_path: Path) -> None:
-    code = REAL.replace("{0}", str(tmp_path)).replace(".format({1!r})", "").replace("{{", "{").replace("}}", "}")
     path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    command = [sys.executable, "-c", REAL, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     endings = json.loads(done.stdout.splitlines()[-1])
     assert endings["first"] == [0, "1\n"]
     assert endings["python"][0] == endings["once"][0] == 0
     assert endings["bad"] == [3, "no power\n"]
-    assert endings["always"][0] == -1
+    assert endings["always"][0] == -9
     assert (tmp_path / "always").read_text() == "x\n" * 3

@@ -40,10 +40,3 @@ def test_more_anchors_keep_their_bits_across_borders(tmp_path: Path) -> None:
         assert [info.kind for info in one.packets] == [info.kind for info in other.packets]
         assert [info.pts_seconds for info in one.packets] == [info.pts_seconds for info in other.packets]
         assert other.packets[LENGTH].kind is PacketKind.KEY
-
-
-def test_it_depends_on_the_segments_alone(tmp_path: Path) -> None:
-    one, other = tmp_path / "a.sgs", tmp_path / "b.sgs"
-    join_segments(made().segments, one, backend=quickest_backend())
-    join_segments(made().segments[::-1], other, backend=quickest_backend())
-    assert one.read_bytes() == other.read_bytes()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from structgstream.errors import ConfigError, OutOfMemoryError
+from structgstream.errors import OutOfMemoryError
 from structgstream.groups import unit as method
 from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.unit import (
@@ -84,11 +84,6 @@ def task(index: int) -> Any:
     )
 
 
-def test_frame_0_is_the_headers() -> None:
-    with pytest.raises(ConfigError, match="a header with frame 0; give one with --init"):
-        group().first(task(0))
-
-
 def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual) -> None:
     found = group().next(Past(SCENE, FrameZeroContext()), task(FIRST))
     ((kind, given),) = usual.asked
@@ -108,15 +103,6 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
     torch.testing.assert_close(moved, 0.5 * torch.arange(15, dtype=torch.float32).reshape(5, 3))
     assert len(second.older.free) == 0
     assert second.state is SCENE
-
-
-def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
-    made = group(first=None)
-    past: Past[Any, Any] = Past(SCENE, FrameZeroContext())
-    for index in (1, 2):
-        made.next(past, task(index))
-    assert usual.asked == [("next", past)] * 2
-    assert usual.thin == ["none"] * 2
 
 
 def test_the_first_frames_catch_up(usual: Usual) -> None:

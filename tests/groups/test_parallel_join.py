@@ -13,10 +13,9 @@ from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.tasks import PYTHON, Task
 from structgstream.groups import join, seam_blend
 from structgstream.groups.base import GroupBase, open_for
-from structgstream.groups.join import MAX_GROUPS, PURPOSE, join_segments, main, read_run, runs_of
+from structgstream.groups.join import MAX_GROUPS, join_segments, runs_of
 from structgstream.groups.seam_blend import FADE_FRAMES, OWN_FRAMES, Border
 from structgstream.groups.track_pass import track_capture
-from structgstream.owned_folders import own_folder
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
 from tests.support.inline_engine import InlineEngine
@@ -57,9 +56,6 @@ def fading_in_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_give_the_bytes_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(join, "LocalEngine", lambda slots: InlineEngine())
     found = []
-    left = tmp_path / "2.sgs.runs" / "run-0"  # By one that was killed.
-    own_folder(left.parent, PURPOSE)
-    left.write_bytes(b"half")
     for workers in (1, 2):
         path, borders = tmp_path / f"{workers}.sgs", list[Border]()
         backend = quickest_backend()
@@ -70,17 +66,6 @@ def test_workers_give_the_bytes_of_one(tmp_path: Path, monkeypatch: pytest.Monke
         found.append((path.read_bytes(), borders))
     assert found[1] == found[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.sgs", "2.sgs"]
-
-
-def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
-    paths, output = made().segments, tmp_path / "run"
-    main([quickest_backend().name, str(output), *map(str, paths)])
-    borders, records = read_run(output)
-    assert [border.frame for border in borders] == [2, 4]
-    whole = tmp_path / "whole.sgs"
-    join_segments(paths, whole, backend=quickest_backend())
-    assert all(record in whole.read_bytes() for record in records)
-    assert len(records) == 4
 
 
 @pytest.mark.usefixtures("fading_in_one_frame")

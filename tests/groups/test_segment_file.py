@@ -2,7 +2,7 @@
 """What is whole of a segment is read, and nothing else: cuts, flipped bits, notes that are none."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +22,7 @@ from structgstream.groups.segment_file import (
     open_segment,
 )
 from tests.support.properties import examples
-from tests.support.small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
+from tests.support.small_segments import END, FIRST, IDENTITY, base, encoded, write
 from tests.support.streams import small_stream
 
 COUNT = END - FIRST
@@ -65,16 +65,6 @@ def test_a_finished_segment_is_read_whole(tmp_path: Path) -> None:
     for number, packet in enumerate(encoded()[0]):
         assert packet.payload in found.record(number)
     assert b"".join(map(found.record, range(COUNT))) == whole()[entries()[0][2] : found.end]
-
-
-def test_facts_are_what_it_is_and_which_frames_it_has(tmp_path: Path) -> None:
-    path = tmp_path / "g.sgs"
-    path.write_bytes(whole()[: ends()[1]])
-    facts = open_segment(path)
-    assert (len(facts.entries), facts.complete) == (2, False)
-    assert facts.identity == IDENTITY
-    assert facts.reason is not None
-    assert facts.reason.startswith("it has 2 of 4 frames; ")
 
 
 @examples(200)
@@ -128,33 +118,6 @@ def test_packets_of_other_frames_are_not_those_of_the_group(tmp_path: Path) -> N
     assert len(opened(tmp_path, without).entries) == 1
     swapped = whole()[:first] + whole()[second:third] + whole()[first:second] + whole()[third:]
     assert not opened(tmp_path, swapped).entries
-
-
-def test_the_group_of_frame_0_has_the_headers_packet(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.sgs", encoded(1, FIRST)[0], identity=FROM_FRAME_0)
-    found = open_segment(path)
-    assert (found.complete, found.record(0)) == (True, base().first)
-
-
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        ({"header": "another"}, "header"),
-        ({"capture": "another"}, "capture"),
-        ({"track": ""}, "track"),
-        ({"options": {"iterations": 7, "births": 50}}, "options"),
-        ({"first": 2}, "first"),
-        ({"end": 8}, "end"),
-    ],
-)
-def test_everything_that_decides_the_bytes_is_in_the_hash(change: dict, name: str) -> None:
-    assert replace(IDENTITY, **change).sha256 != IDENTITY.sha256, name
-
-
-def test_the_order_of_options_is_not() -> None:
-    turned = replace(IDENTITY, options={name: IDENTITY.options[name] for name in reversed([*IDENTITY.options])})
-    assert [*turned.options] != [*IDENTITY.options]
-    assert (turned.sha256, turned.record()) == (IDENTITY.sha256, IDENTITY.record())
 
 
 def noted(**change: object) -> bytes:

@@ -79,13 +79,6 @@ def test_the_segment_of_frame_0_begins_with_it(tmp_path: Path) -> None:
     assert (found.complete, found.record(0)) == (True, base().first)
 
 
-def test_a_group_has_no_other_period(tmp_path: Path) -> None:
-    sink = SegmentSink(tmp_path / "g.sgs", base(), IDENTITY, None)
-    with pytest.raises(ConfigError, match="cannot begin another period; leave out --period"):
-        sink.begin(base().header)
-    sink.close()
-
-
 @examples(80)
 @given(st.data())
 def test_cut_and_flipped_anywhere_it_goes_on_to_the_same_bytes(
@@ -108,22 +101,6 @@ def test_a_finished_segment_is_left(tmp_path: Path, whole: bytes) -> None:
     before = path.stat()
     assert go_on(path) == 0
     assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
-
-
-def test_what_is_whole_but_was_killed_before_it_had_its_name_gets_it(tmp_path: Path, whole: bytes) -> None:
-    path = tmp_path / "g.sgs"
-    partial_path(path).write_bytes(whole)
-    found = resume_segment(path, base(), IDENTITY)
-    assert found is not None
-    assert found.complete
-    assert path.read_bytes() == whole
-    assert not partial_path(path).exists()
-
-
-def test_nothing_is_gone_on_with_where_nothing_is(tmp_path: Path) -> None:
-    assert resume_segment(tmp_path / "g.sgs", base(), IDENTITY) is None
-    partial_path(tmp_path / "g.sgs").touch()
-    assert resume_segment(tmp_path / "g.sgs", base(), IDENTITY) is None
 
 
 def test_the_same_note_after_other_bytes_of_the_header_counts_as_nothing(tmp_path: Path, whole: bytes) -> None:
@@ -186,12 +163,6 @@ def test_a_session_sees_a_stream_that_has_come_to_the_group() -> None:
     assert len(so_far(0)) == FIRST
     period = found.period(5)
     assert (period.number, period.offset + period.bytes) == (0, len(base().init))
-
-
-def test_a_frame_needs_the_packets_from_its_key_on() -> None:
-    found = so_far(4)
-    needed = [[packet.index for packet in found.group(frame)] for frame in range(FIRST - 1, END)]
-    assert needed == [[0], [FIRST], [FIRST, FIRST + 1], [FIRST + 2], [FIRST + 2, FIRST + 3]]
 
 
 def test_frames_are_those_that_the_encoder_saw() -> None:

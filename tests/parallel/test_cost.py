@@ -87,7 +87,5 @@ def test_the_workers_for_a_finish_are_the_least_that_end_in_time(seconds: float)
 
 
 def test_nothing_less_than_one_is_planned() -> None:
-    with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
-        estimate(COSTS, WORK, 0)
     with pytest.raises(ConfigError, match="group must be 1 or more, got 0"):
         Work(10, 0, 10)

@@ -5,12 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.executors.tasks import Task
 from structgstream.parallel import exchange
 from structgstream.parallel.driver import drive
-from structgstream.parallel.exchange import ObjectFolder, ObjectStore, SharedFolder
+from structgstream.parallel.exchange import ObjectFolder, ObjectStore
 from structgstream.parallel.parts import Parts
-from tests.support import stand_in
 from tests.support.flaky_store import flaky_store
 from tests.support.stand_ins import job, sha256, workers
 
@@ -29,7 +27,7 @@ def stored(folder: Path, url: str) -> Path:
     parts = Parts(folder / "parts")
     (folder / "b").mkdir(exist_ok=True)
     with parts.locked(), workers() as executor:
-        exchange = ObjectStore(ObjectFolder(url), parts, cut=stand_in.cut)
+        exchange = ObjectStore(ObjectFolder(url), parts)
         drive(job(folder / "b", frames=8), parts, executor, exchange=exchange)
     return folder / "b" / "out.sgs"
 
@@ -56,8 +54,3 @@ def test_a_store_that_refuses_every_third_request_costs_only_time(
     with flaky_store(3) as (url, application):
         assert sha256(stored(tmp_path, url)) == sha256(plain)
         assert application.refused >= 10
-
-
-def test_a_shared_folder_changes_no_task(tmp_path: Path) -> None:
-    task, shared = Task("task", ("true",)), SharedFolder()
-    assert shared.header(task) is shared.track(task) is shared.group(task, 4) is task

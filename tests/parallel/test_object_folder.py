@@ -65,8 +65,3 @@ def test_failures_are_tried_again_so_often(store: ObjectFolder, monkeypatch: pyt
     else:
         with pytest.raises(StorageError, match="the cable is out"):
             store.read("a")
-
-
-def test_a_url_of_no_scheme_that_is_known_is_reported() -> None:
-    with pytest.raises(StorageError, match="nonsense://a cannot be used as a store"):
-        ObjectFolder("nonsense://a")

@@ -9,10 +9,10 @@ import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from structgstream.errors import ConfigError
 from structgstream.parallel import exchange as staged
 from structgstream.parallel.driver import Unit
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore, Staging, Transfer
@@ -37,19 +37,11 @@ def staging(store: ObjectFolder, tmp_path: Path) -> Staging:
     return Staging(store, tmp_path / "here")
 
 
-def run(store: ObjectFolder, script: str, *flags: str) -> int:
-    """The status of a command whose first word is the folder of this machine."""
+def run(store: ObjectFolder, script: str, **files: Any) -> int:
+    """The status of a command with these files, whose first word is the folder of this machine."""
     with pytest.MonkeyPatch.context() as variables:
         variables.setenv(staged.STORE, store.url)
-        return staged.run(transfer(*flags), ["sh", "-c", script, staged.HERE])
-
-
-def transfer(*flags: str) -> Transfer:
-    """The files of a task from pairs such as ``--needs NAME``."""
-    found: dict[str, list[str]] = {"needs": [], "gives": [], "grows": [], "run": []}
-    for flag, name in zip(flags[::2], flags[1::2]):
-        found[flag.removeprefix("--")].append(name)
-    return Transfer("task", "".join(found.pop("run")), **{kind: tuple(names) for kind, names in found.items()})
+        return staged.run(Transfer("task", **files), ["sh", "-c", script, staged.HERE])
 
 
 def scratch(tmp_path: Path) -> list[Path]:
@@ -58,31 +50,31 @@ def scratch(tmp_path: Path) -> list[Path]:
 
 def test_needs_are_fetched_and_results_stored(store: ObjectFolder, tmp_path: Path) -> None:
     store.write("in/a", b"content")
-    flags = ("--needs", "in/a", "--needs", "absent", "--gives", "out/b")
-    assert run(store, 'mkdir -p "$0/out" && tr a-z A-Z < "$0/in/a" > "$0/out/b" && [ ! -e "$0/absent" ]', *flags) == 0
+    script = 'mkdir -p "$0/out" && tr a-z A-Z < "$0/in/a" > "$0/out/b" && [ ! -e "$0/absent" ]'
+    assert run(store, script, needs=("in/a", "absent"), gives=("out/b",)) == 0
     assert store.read("out/b") == b"CONTENT"
     assert not scratch(tmp_path)
 
 
 def test_what_a_killed_command_has_left_is_not_taken_and_stays_here(store: ObjectFolder, tmp_path: Path) -> None:
     store.write("a", b"a")
-    flags = ("--needs", "a", "--gives", "b")
-    assert run(store, 'echo half > "$0/b"; exit 137', *flags) == 137
+    files = {"needs": ("a",), "gives": ("b",)}
+    assert run(store, 'echo half > "$0/b"; exit 137', **files) == 137
     assert store.read("b") is None
     # The next attempt finds it.
-    assert run(store, 'grep -q half "$0/b"', *flags) == 0
+    assert run(store, 'grep -q half "$0/b"', **files) == 0
     assert store.read("b") == b"half\n"
     assert not scratch(tmp_path)
 
 
 def test_what_a_failing_command_has_left_is_removed(store: ObjectFolder, tmp_path: Path) -> None:
-    assert run(store, 'echo half > "$0/b"; exit 3', "--gives", "b") == 3
+    assert run(store, 'echo half > "$0/b"; exit 3', gives=("b",)) == 3
     assert not scratch(tmp_path)
 
 
 def test_a_command_ends_with_the_process_that_stages_it(store: ObjectFolder, tmp_path: Path) -> None:
     script = f"echo $$ > {tmp_path}/pid.new; mv {tmp_path}/pid.new {tmp_path}/pid; exec sleep 60"
-    words = [sys.executable, "-m", staged.__name__, json.dumps(asdict(transfer())), "sh", "-c", script]
+    words = [sys.executable, "-m", staged.__name__, json.dumps(asdict(Transfer("task"))), "sh", "-c", script]
     process = subprocess.Popen(words, env={**os.environ, staged.STORE: store.url})
     wait_for(tmp_path / "pid")
     process.kill()
@@ -91,31 +83,21 @@ def test_a_command_ends_with_the_process_that_stages_it(store: ObjectFolder, tmp
 
 
 def test_a_run_that_was_begun_anew_finds_nothing_of_the_one_before(store: ObjectFolder, tmp_path: Path) -> None:
-    flags = ("--needs", "header", "--gives", "b")
+    files = {"needs": ("header",), "gives": ("b",)}
     store.write("header", b"old")
-    assert run(store, 'echo half > "$0/b"; exit 137', "--run", "1", *flags) == 137
+    assert run(store, 'echo half > "$0/b"; exit 137', run="1", **files) == 137
     store.write("header", b"new")
-    assert run(store, 'grep -q new "$0/header"; [ -e "$0/b" ]; exit 137', "--run", "1", *flags) == 137
+    assert run(store, 'grep -q new "$0/header"; [ -e "$0/b" ]; exit 137', run="1", **files) == 137
     (other,) = scratch(tmp_path)
     mine = other.with_name(other.name.replace("-1", "-mine"))
     mine.mkdir()
-    assert run(store, 'grep -q new "$0/header" && [ ! -e "$0/b" ]', "--run", "2", *flags) == 0
+    assert run(store, 'grep -q new "$0/header" && [ ! -e "$0/b" ]', run="2", **files) == 0
     assert scratch(tmp_path) == [mine], "a folder without a marker stays"
-
-
-def test_an_earlier_attempt_here_is_not_replaced_by_the_store(staging: Staging) -> None:
-    staging.store.write("a", b"store")
-    staging.fetch("a")
-    assert (staging.folder / "a").read_bytes() == b"store"
-    (staging.folder / "a").write_bytes(b"further")
-    staging.fetch("a")
-    assert (staging.folder / "a").read_bytes() == b"further"
-    assert [path.name for path in staging.folder.iterdir()] == ["a"]
 
 
 def test_a_result_of_before_is_brought_to_be_checked(store: ObjectFolder) -> None:
     store.write("b", b"before\n")
-    assert run(store, 'grep -q before "$0/b"', "--gives", "b") == 0
+    assert run(store, 'grep -q before "$0/b"', gives=("b",)) == 0
 
 
 def test_growing_files_are_stored_before_the_command_ends(store: ObjectFolder, tmp_path: Path) -> None:
@@ -129,20 +111,20 @@ until [ "$(cat "{stored}/t.partial")" = abcde ]; do sleep 0.01; done
 printf f >> "$0/t.partial"; mv "$0/t.partial" "$0/t"
 """
     store.write("unused", b"")
-    assert run(store, script, "--grows", "t.groups", "--grows", "t.partial", "--gives", "t") == 0
+    assert run(store, script, grows=("t.groups", "t.partial"), gives=("t",)) == 0
     assert store.read("t") == b"abcdef"
 
 
 def test_a_growing_file_goes_on_here_or_on_another_machine(store: ObjectFolder, tmp_path: Path) -> None:
-    flags = ("--grows", "t.partial", "--gives", "t")
+    files = {"grows": ("t.partial",), "gives": ("t",)}
     store.write("t.partial", b"abc")
-    assert run(store, 'printf d >> "$0/t.partial"; exit 137', *flags) == 137
+    assert run(store, 'printf d >> "$0/t.partial"; exit 137', **files) == 137
     store.write("t.partial", b"of another attempt")
-    assert run(store, 'printf e >> "$0/t.partial"; exit 137', *flags) == 137
+    assert run(store, 'printf e >> "$0/t.partial"; exit 137', **files) == 137
     assert store.read("t.partial") == b"abcde"
     shutil.rmtree(tmp_path / "scratch")
     store.write("t", b"whole")
-    assert run(store, '[ ! -e "$0/t.partial" ]', *flags) == 0, "a whole file is not one that grows"
+    assert run(store, '[ ! -e "$0/t.partial" ]', **files) == 0, "a whole file is not one that grows"
 
 
 def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) -> None:
@@ -161,7 +143,7 @@ def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) ->
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
-    words = [json.dumps(asdict(transfer("--grows", "t.partial"))), "sh", "-c"]
+    words = [json.dumps(asdict(Transfer("task", grows=("t.partial",)))), "sh", "-c"]
     script = 'printf abc > "$0/t.partial"; kill -9 $$'
     done = subprocess.run(
         [sys.executable, "-m", "structgstream.parallel.exchange", *words, script, staged.HERE],
@@ -184,15 +166,10 @@ def test_a_store_that_cannot_be_used_is_a_sentence(
     assert error.count("\n") == 1
 
 
-def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path) -> None:
     """It may hold credentials, and every user of a machine sees command lines."""
     url = f"file://{tmp_path / 'secret'}"
     parts = Parts(tmp_path / "a.parts")
-    unit = Unit("capture")
-    exchange = ObjectStore(ObjectFolder(url), parts, cut=unit.cut)
-    task = exchange.header(unit.header_task(parts))
+    task = ObjectStore(ObjectFolder(url), parts).header(Unit("capture").header_task(parts))
     assert not any("secret" in word for word in task.command)
     assert task.environment[staged.STORE] == url
-    monkeypatch.delenv(staged.STORE, raising=False)
-    with pytest.raises(ConfigError, match="has no URL of a store"):
-        staged.run(transfer(), ["true"])

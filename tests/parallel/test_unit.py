@@ -1,22 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of a parallel run, which the programs understand, and what is read of a track while it grows."""
+"""The commands of a parallel run, which the programs understand."""
 
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from structgstream.atomic_files import partial_path
 from structgstream.cli.groups import FitGroup, Join, Track
 from structgstream.cli.options import parse_options
-from structgstream.errors import StreamError
 from structgstream.executors.tasks import PYTHON
-from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
-from structgstream.parallel.driver import Unit, cut_track, starts_in
+from structgstream.parallel.driver import Unit
 from structgstream.parallel.parts import Parts
-
-HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 
 
 @pytest.fixture
@@ -78,42 +72,3 @@ def test_without_a_number_all_frames_are_tracked_with_as_many_threads_as_asked(t
     task = unit(tmp_path, track_threads=3).track_task(parts)
     assert "--frames" not in task.command
     assert task.environment["OMP_NUM_THREADS"] == "3"
-
-
-def start(frame: int) -> TrackStart:
-    movers = np.arange(0, 35, 5, dtype=np.int32)
-    steps = np.full((7, 3), frame, dtype=np.int32)
-    return TrackStart(frame, movers, steps, -steps, np.zeros(4, dtype=np.float32))
-
-
-@pytest.fixture
-def growing(tmp_path: Path) -> Path:
-    """A track of which two starts are there."""
-    writer = TrackWriter(tmp_path / "track", HEAD)
-    writer.write(start(4))
-    writer.write(start(8))
-    writer.close()
-    return tmp_path / "track"
-
-
-def test_the_starts_of_a_growing_track_are_those_that_are_whole(growing: Path) -> None:
-    assert [*starts_in(growing)] == [4, 8]
-    data = partial_path(growing).read_bytes()
-    partial_path(growing).write_bytes(data[:-1])
-    assert [*starts_in(growing)] == [4]
-    partial_path(growing).write_bytes(data[:5])
-    assert not starts_in(growing)
-    partial_path(growing).unlink()
-    assert not starts_in(growing)
-
-
-def test_a_group_gets_the_one_start_that_it_needs(growing: Path, tmp_path: Path) -> None:
-    before = partial_path(growing).read_bytes()
-    path = tmp_path / "one"
-    partial_path(path).write_bytes(cut_track(growing, 8))
-    found = open_track(path)
-    assert (found.starts, found.head) == ([8], HEAD)
-    assert found.start(8).packed() == open_track(growing).start(8).packed()
-    with pytest.raises(StreamError, match="no start at frame 12"):
-        cut_track(growing, 12)
-    assert partial_path(growing).read_bytes() == before

@@ -25,14 +25,6 @@ def content(folder: Path, *parts: str) -> bytes | None:
         return opened[:]
 
 
-def test_a_file_at_any_depth(tmp_path: Path) -> None:
-    (tmp_path / "a" / "b").mkdir(parents=True)
-    (tmp_path / "a" / "b" / "file").write_bytes(b"deep")
-    (tmp_path / "file").write_bytes(b"shallow")
-    assert content(tmp_path, "a", "b", "file") == b"deep"
-    assert content(tmp_path, "file") == b"shallow"
-
-
 def test_nothing_that_is_no_file_is_opened(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"x")
@@ -82,22 +74,6 @@ def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
     assert count() == before
 
 
-def test_the_stamp_changes_when_a_file_grows_or_is_replaced(tmp_path: Path) -> None:
-    stamps = []
-    for step in range(3):
-        if step < 2:
-            with (tmp_path / "file").open("ab") as file:
-                file.write(b"x" * 10)
-        else:
-            (tmp_path / "other").write_bytes(b"y" * 20)
-            (tmp_path / "other").replace(tmp_path / "file")
-        opened = open_below(tmp_path, "file")
-        assert opened is not None
-        stamps.append(opened.stamp)
-        opened.close()
-    assert len(set(stamps)) == 3
-
-
 PLAIN = string.ascii_letters + string.digits + "._-"
 
 
@@ -140,13 +116,6 @@ def test_a_name_of_a_stream_is_one_part_of_an_address_as_it_stands(name: str) ->
         assert is_plain_path(path.encode("ascii"))
         assert PurePosixPath(path).parts == ("/", "streams", name)
         assert not name.startswith(".")
-
-
-@given(st.lists(st.text(PLAIN, max_size=4), max_size=5))
-@examples(400)
-def test_a_plain_path_never_leads_up(parts: list[str]) -> None:
-    path = "/" + "/".join(parts)
-    assert is_plain_path(path.encode()) == (not {".", ".."} & set(parts))
 
 
 @given(st.integers(0, 2**32 - 1), st.binary(max_size=4))

@@ -33,7 +33,7 @@ from structgstream.exporters.write import write_gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.notebook import Player
 from structgstream.sequence_import import import_sequence
-from structgstream.serve.pages import StreamFile, bundle_path, linked_page, write_page, write_site
+from structgstream.serve.pages import StreamFile, bundle, linked_page, write_page, write_site
 from structgstream.serve.play import Truth
 from tests.support.chromium import Browser, Tab, opened_browser
 from tests.support.pictures import decoded_picture
@@ -215,7 +215,7 @@ def test_segments_play_from_a_host_of_files_while_they_are_written(tab: Tab, str
         sink.write(packet)
     page = linked_page("live", stream="streams/live/manifest.json", attributes={"autoplay": ""})
     (root / "index.html").write_text(page)
-    (root / "player.js").write_bytes(bundle_path().read_bytes())
+    (root / "player.js").write_text(bundle(), encoding="utf-8")
     with (nginx if shutil.which("nginx") else python_host)(root) as address:
         tab.open(f"{address}index.html", width=WIDTH, height=HEIGHT)
         tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1 && {PLAYER}.live")

@@ -124,10 +124,6 @@ def test_a_module_that_ends_its_element_is_escaped_and_a_comment_refused() -> No
         inline_module("x = '<!-- <script>'")
 
 
-def test_the_bundle_can_be_inlined() -> None:
-    assert "</script" not in inline_module(bundle()).lower()
-
-
 def test_a_stream_that_is_too_long_for_a_page_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "MAX_PAGE_STREAM_BYTES", len(STREAM) - 1)
     with pytest.raises(PlayerError, match="structgstream play"):

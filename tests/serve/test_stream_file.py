@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError, StreamError
 from structgstream.serve.pages import StreamFile, check_has_header, write_page, write_site
@@ -26,21 +25,6 @@ def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamF
         file.path.write_bytes(STREAM[:length])
         assert file.has_header() == (length >= HEADER_BYTES)
         assert file.state() == (length, length == len(STREAM))
-
-
-@pytest.mark.parametrize(
-    "end",
-    [
-        FOOTER.pack(0, FOOTER_MAGIC),
-        FOOTER.pack(2**63, FOOTER_MAGIC),
-        FOOTER.pack(len(STREAM) - 1, FOOTER_MAGIC),
-        FOOTER.pack(HEADER_BYTES, FOOTER_MAGIC),
-        FOOTER.pack(len(STREAM) - 40, b"SGSINDEY"),
-    ],
-)
-def test_a_footer_that_points_to_no_index_is_none(file: StreamFile, end: bytes) -> None:
-    file.path.write_bytes(STREAM[: -FOOTER.size] + end)
-    assert not file.state()[1]
 
 
 @pytest.mark.parametrize(

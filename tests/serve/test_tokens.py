@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from starlette.requests import Request
 
 from structgstream.errors import ConfigError
 from structgstream.serve import access as tokens
-from structgstream.serve.access import EVERY_STREAM, Access, TokenKeys, read_keys
+from structgstream.serve.access import EVERY_STREAM, Access, TokenKeys, read_keys, token_of
 from structgstream.serve.app import ServerSettings
 from tests.support.segment_folders import GrowingFolder
 from tests.support.serving import Served, hosted
@@ -54,11 +55,6 @@ def test_a_token_with_another_character_opens_nothing(place: int, character: str
     if forged != TOKEN:
         # The last digit of a signature has two bits that mean nothing; the text is compared, so they count too.
         assert KEYS.access(forged, "studio", unix_seconds=NOW) is Access.FORGED
-
-
-@given(st.text(max_size=300))
-def test_other_texts_open_nothing(text: str) -> None:
-    assert KEYS.access(text, "studio", unix_seconds=NOW) in (Access.FORGED, Access.MISSING)
 
 
 def test_parts_of_two_tokens_open_nothing() -> None:
@@ -102,7 +98,6 @@ def test_a_secret_is_replaced_while_its_tokens_are_about(tmp_path: Path) -> None
         (b" \n\n", "is empty"),
         (b"short\n", "has 5 characters, and at least 32 are needed"),
         (b"x" * 40 + b"\nshort\n", "has 5 characters"),
-        (b"x" * 100_000, "has over 65536 bytes"),
     ],
 )
 def test_secrets_that_are_refused(tmp_path: Path, content: bytes | None, words: str) -> None:
@@ -134,10 +129,12 @@ def everything(tmp_path: Path) -> list[str]:
 
 
 def test_nothing_is_shown_without_a_token(server: Served, tmp_path: Path) -> None:
+    missing, forged = b"An access token is needed here.", b"The access token is not one of this server."
+    queries = {"": missing, "?token=": missing, "?token=v1.9999999999.x.studio": forged, f"?token={TOKEN[:-1]}": forged}
     for address in (*everything(tmp_path), "/", "/streams.json", "/metrics", "/streams/nobody/", "/streams/nobody/x"):
-        for query in ("", "?token=", "?token=v1.9999999999.x.studio", f"?token={TOKEN[:-1]}"):
+        for query, words in queries.items():
             answer = server.ask(address + query)
-            assert answer.status == 401, address
+            assert (answer.status, answer.body) == (401, words), address
             assert answer.headers["www-authenticate"].startswith("Bearer")
             assert answer.headers["cache-control"] == "no-store"
     assert server.ask("/health").status == 200
@@ -153,11 +150,23 @@ def test_a_token_in_the_query_or_the_header(server: Served, tmp_path: Path) -> N
         assert server.ask(address, Authorization=f"Basic {TOKEN}").status == 401
 
 
+def test_the_header_comes_before_the_query() -> None:
+    def found(authorization: str) -> str | None:
+        headers = [(b"authorization", authorization.encode())]
+        return token_of(Request({"type": "http", "headers": headers, "query_string": b"token=one"}))
+
+    assert found("Bearer two.~+/-_==") == "two.~+/-_=="
+    assert found("bEARER   two") == "two"
+    for other in ("Basic two", "Bearer", "Bearer two three", "Bearer two\n", "Bearer =", "Bearertwo"):
+        assert found(other) == "one", other
+
+
 def test_a_token_of_another_stream_and_one_that_expired(server: Served, tmp_path: Path) -> None:
     other = KEYS.token("ball.sgs", expires_unix_seconds=int(NOW) + 60)
     old = KEYS.token("studio", expires_unix_seconds=int(NOW))
     for address in everything(tmp_path):
-        assert server.ask(f"{address}?token={other}").status == 403
+        refused = server.ask(f"{address}?token={other}")
+        assert (refused.status, refused.body) == (403, b"The access token is for another stream.")
         expired = server.ask(f"{address}?token={old}")
         assert (expired.status, expired.body) == (401, b"The access token has expired.")
     # It does not say which streams there are, either.

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
+from unittest.mock import patch
 
 BUCKET = "parts"
 Respond = Callable[..., Any]
@@ -50,18 +51,12 @@ def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
         "AWS_DEFAULT_REGION": "us-east-1",
         "AWS_MAX_ATTEMPTS": "1",  # What is tried again is tried by us.
     }
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
     try:
-        s3fs.S3FileSystem.clear_instance_cache()  # Those of an earlier server go to its address.
-        with suppress(FileExistsError):  # What moto holds outlives its server.
-            s3fs.S3FileSystem().mkdir(BUCKET)
-        application.every = every
-        yield f"s3://{BUCKET}/run", application
+        with patch.dict(os.environ, variables):
+            s3fs.S3FileSystem.clear_instance_cache()  # Those of an earlier server go to its address.
+            with suppress(FileExistsError):  # What moto holds outlives its server.
+                s3fs.S3FileSystem().mkdir(BUCKET)
+            application.every = every
+            yield f"s3://{BUCKET}/run", application
     finally:
         server.shutdown()
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value

@@ -8,22 +8,16 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import IO
+from unittest.mock import patch
 
 from structgstream.executors.tasks import Task, TaskResult, opened_log, tail_of
-
-INTERRUPTED = 130
-"""Exit status of a command that was ended by Ctrl-C."""
 
 
 class InlineEngine:
     """Runs ``{python} -m MODULE ...``."""
-
-    name = "inline"
-    repeats = False
 
     def __init__(self) -> None:
         self._next: Task | None = None
@@ -54,15 +48,16 @@ class InlineEngine:
 
 
 def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> tuple[int, str]:
-    """Runs a module as a program; returns its exit status and the end of its output.
-
-    Raises:
-        KeyboardInterrupt: the user pressed Ctrl-C, also if the program handled it and ended.
-    """
+    """Runs a module as a program; returns its exit status and the end of its output."""
     with opened_log(log) as file:
         began_at = file.tell()
         with io.TextIOWrapper(file, write_through=True) as text:
-            with _printing(text), _as_program(module, arguments, environment):
+            with (
+                redirect_stdout(text),
+                redirect_stderr(text),
+                patch.object(sys, "argv", [module, *arguments]),
+                patch.dict(os.environ, environment),
+            ):
                 status = _status_of(module)
             return status, tail_of(file, began_at)
 
@@ -74,8 +69,6 @@ def _status_of(module: str) -> int:
             warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")
             runpy.run_module(module, run_name="__main__", alter_sys=True)
     except SystemExit as error:
-        if error.code == INTERRUPTED:
-            raise KeyboardInterrupt from None
         if isinstance(error.code, str):
             print(error.code, file=sys.stderr)
         return 0 if error.code is None else error.code if isinstance(error.code, int) else 1
@@ -83,27 +76,3 @@ def _status_of(module: str) -> int:
         traceback.print_exc()
         return 1
     return 0
-
-
-@contextmanager
-def _as_program(module: str, arguments: list[str], environment: Mapping[str, str]) -> Iterator[None]:
-    """Sets the arguments and variables of a separate process, and restores them afterwards."""
-    given, before = sys.argv, dict(os.environ)
-    sys.argv = [module, *arguments]
-    os.environ.update(environment)
-    try:
-        yield
-    finally:
-        sys.argv = given
-        for name in environment:
-            if name in before:
-                os.environ[name] = before[name]
-            else:
-                os.environ.pop(name, None)
-
-
-@contextmanager
-def _printing(text: IO[str]) -> Iterator[None]:
-    """Redirects the output of the block to ``text``."""
-    with redirect_stdout(text), redirect_stderr(text):
-        yield

@@ -6,16 +6,20 @@
     python -m tests.support.stand_in fit-group CAPTURE --init HEADER --track TRACK --frames 4:8 -o SEGMENT
     python -m tests.support.stand_in join SEGMENT... -o OUT
 
-Every frame takes ``STAND_IN_SECONDS`` (0.01) and adds a line to ``NAME.partial``, which is renamed when it is whole.
-What is whole in a partial or damaged file is kept. It imports nothing of the package, so that it begins at once.
+Every frame takes ``STAND_IN_SECONDS`` (0.01) and adds a line to ``NAME.partial``, which is renamed when it is whole; a
+track has records, which the driver reads. What is whole in a partial or damaged file is kept. It imports nothing of the
+package, so that it begins at once.
 """
 
 import argparse
 import fcntl
 import hashlib
+import json
 import os
+import struct
 import sys
 import time
+import zlib
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
@@ -23,73 +27,68 @@ from pathlib import Path
 BYTES = 64
 
 
-def line(*facts: object) -> str:
+def line(*facts: object) -> bytes:
     """A frame: deterministic, with its own checksum at the end."""
     body = hashlib.sha256(repr(facts).encode()).hexdigest()[:BYTES]
-    return f"{facts[0]} {facts[1]} {body} {hashlib.sha256(body.encode()).hexdigest()[:8]}\n"
+    return f"{facts[0]} {facts[1]} {body} {hashlib.sha256(body.encode()).hexdigest()[:8]}\n".encode()
 
 
-def written(path: Path, lines: Iterable[str], *, seconds: float) -> None:
-    """Writes the lines that are not there, slowly, and gives the file its name when all are."""
-    wanted = list(lines)
+def record(kind: int, payload: bytes) -> bytes:
+    """A record of a track."""
+    head = struct.pack("<BBHI", kind, 0, 0, len(payload))
+    return head + payload + struct.pack("<I", zlib.crc32(head + payload))
+
+
+def start(frame: int) -> bytes:
+    """The record of a start at which nothing has moved."""
+    return record(2, struct.pack("<III", frame, 0, 1) + zlib.compress(bytes(2), 9))
+
+
+def written(path: Path, pieces: Iterable[bytes], *, seconds: float) -> None:
+    """Writes the pieces that are not there, slowly, and gives the file its name when all are."""
+    wanted = list(pieces)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.partial")
     source = path if path.exists() else partial
-    found = source.read_text(errors="replace").splitlines(keepends=True) if source.exists() else []
-    if path.exists() and found == wanted:
+    found = source.read_bytes() if source.exists() else b""
+    if path.exists() and found == b"".join(wanted):
         return
-    with partial.open("a+") as file:
+    with partial.open("ab") as file:
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             sys.exit(f"Another process writes {partial}.")
-        whole = next((i for i, (a, b) in enumerate(zip(found, wanted)) if a != b), min(len(found), len(wanted)))
         file.truncate(0)
-        file.write("".join(wanted[:whole]))
-        for text in wanted[whole:]:
-            time.sleep(seconds)
-            file.write(text)
+        at = 0
+        for piece in wanted:
+            is_there = found[at : at + len(piece)] == piece
+            at = at + len(piece) if is_there else len(found)
+            if not is_there:
+                time.sleep(seconds)
+            file.write(piece)
             file.flush()
         os.fsync(file.fileno())
         partial.replace(path)
 
 
-def starts(track: Path) -> list[int]:
-    """The frames at which a group may begin by now."""
-    for path in (track, track.with_name(f"{track.name}.partial")):
-        try:
-            lines = path.read_text().splitlines(keepends=True)
-        except OSError:
-            continue
-        return [int(text.split()[1]) for text in lines if text.endswith("\n")]
-    return []
-
-
-def cut(path: Path, first: int) -> bytes:
-    """A track with one start."""
-    for each in (path, path.with_name(f"{path.name}.partial")):
-        if each.exists():
-            lines = each.read_text().splitlines(keepends=True)
-            return "".join(text for text in lines if text.startswith(f"start {first} ")).encode()
-    raise FileNotFoundError(path)
-
-
 def track(options: argparse.Namespace, seconds: float) -> None:
-    """A start for each group, and the groups."""
+    """A start for each group but the first, and the groups."""
     borders = [*range(0, options.count, options.groups), options.count]
     text = "".join(f"{first}:{end}\n" for first, end in pairwise(borders))
     groups = options.output.with_name(f"{options.output.name}.groups")
     new = groups.with_name(f".{os.getpid()}-{groups.name}")
     new.write_text(text)
     new.replace(groups)
-    header = options.init.read_text()
-    written(options.output, (line("start", first, header) for first in borders[:-1]), seconds=seconds)
+    head = {"header": options.init.read_text(), "capture": "", "step": 1.0, "primitives": 0, "every": 1, "config": {}}
+    begin = struct.pack("<8sHH", b"\x89SGT\r\n\x1a\n", 1, 0) + record(1, json.dumps(head).encode())
+    written(options.output, [begin, *map(start, borders[1:-1])], seconds=seconds)
 
 
 def segment(options: argparse.Namespace, seconds: float) -> None:
     """The frames of a group."""
     first, end = (int(word) for word in options.frames.split(":"))
-    if first and first not in starts(options.track):
+    paths = (options.track, options.track.with_name(f"{options.track.name}.partial"))
+    if first and not any(path.exists() and start(first) in path.read_bytes() for path in paths):
         sys.exit(f"{options.track} has no start at frame {first}.")
     header = options.init.read_text()
     written(options.output, (line("frame", i, header) for i in range(first, end)), seconds=seconds)

@@ -13,7 +13,7 @@ PROGRAM = (PYTHON, "-I", "-S", stand_in.__file__)
 
 def job(folder: Path, *, frames: int = 12, group: int = 4, program: tuple[str, ...] = PROGRAM) -> Job:
     """Three groups of four frames."""
-    unit = Unit("capture", frames, track=("--groups", str(group)), program=program, starts=stand_in.starts)
+    unit = Unit("capture", frames, track=("--groups", str(group)), program=program)
     return Job(unit, folder / "out.sgs")
 
 

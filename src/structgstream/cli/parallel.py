@@ -127,7 +127,7 @@ def main(arguments: list[str]) -> None:
         executor = open_tasks(chosen, options.device)
     with executor:
         job = _job(options, rest)
-        store = None if options.store is None else ObjectStore(ObjectFolder(options.store), parts, cut=job.unit.cut)
+        store = None if options.store is None else ObjectStore(ObjectFolder(options.store), parts)
         stored = None if store is None else store.check_owner(job.key)
         owner = parts.check() or stored or replace(Owner.new(PURPOSE), key=job.key)
         with parts.locked(owner=owner):

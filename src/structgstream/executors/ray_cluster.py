@@ -11,7 +11,6 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +39,6 @@ class RayEngine:
         ConfigError: Ray is too old, there is no token for the cluster, or the cluster cannot be joined.
     """
 
-    name = "ray"
-    repeats = True
-
     def __init__(self, address: str | None = None, workers: int = 1, cores: int = 1) -> None:
         self._cores = cores
         _protect(begins_one=address is None)
@@ -53,12 +49,9 @@ class RayEngine:
         except ConfigError:
             self._folder.cleanup()
             raise
+        self._remote = self._ray.remote(run_task)
         self._pending: dict[Any, tuple[str, float]] = {}
         self._counted = (-COUNT_SECONDS, 0)
-
-    @cached_property
-    def _remote(self) -> Any:
-        return self._ray.remote(run_task)
 
     def check(self, gpus: int) -> None:
         """See ``Engine.check``; the cluster may get GPUs later."""
@@ -77,8 +70,7 @@ class RayEngine:
             name=task.name,
             num_cpus=self._cores,
             num_gpus=gpus,
-            max_retries=task.retries,
-            retry_exceptions=[CommandKilled],
+            max_retries=0,  # The queue restarts killed tasks.
             scheduling_strategy="SPREAD",  # Otherwise one machine gets all tasks while others start their workers.
         )
         # Another machine cannot write its output to a file of this machine.
@@ -162,13 +154,8 @@ def _join(ray: Any, address: str | None, cores: int, folder: Path) -> None:
 POLL_SECONDS = 1.0
 
 
-class CommandKilled(Exception):
-    """A signal ended a command; Ray restarts the task."""
-
-
 def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
-    """Runs the command in a process of this machine, which is killed when this process ends. Raises CommandKilled if a
-    signal ended it; the message has the signal and the command's output."""
+    """Runs the command in a process of this machine, which is killed when this process ends."""
     process = CommandProcess(task, environment=environment)
     try:
         # Ray cancels a task by raising an exception between two Python instructions, so a wait must be short.
@@ -179,6 +166,4 @@ def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
         raise
     result = process.ended()
     assert result is not None, "the process has ended"
-    if result.killed:
-        raise CommandKilled(f"{task.name} was ended by signal {-result.status}. {result.output}")
     return result

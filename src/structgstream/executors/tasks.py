@@ -67,14 +67,10 @@ class TaskResult:
         return self.status < 0
 
 
-def argv_of(command: tuple[str, ...]) -> list[str]:
-    """The argument vector on this machine."""
-    return [sys.executable if word == PYTHON and not i else word for i, word in enumerate(command)]
-
-
 def tied_argv(command: tuple[str, ...]) -> list[str]:
-    """As :func:`argv_of`, of a process that is killed when this one ends (``launch.py``)."""
-    return [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid()), *argv_of(command)]
+    """The argument vector on this machine of a process that is killed when this one ends (``launch.py``)."""
+    first = sys.executable if command[0] == PYTHON else command[0]
+    return [sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), first, *command[1:]]
 
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -202,9 +198,6 @@ def tail_of(file: BinaryIO, begin: int) -> str:
 class LocalEngine:
     """Processes in slots: shares of the cores, or GPUs (``task.allocate_slots``)."""
 
-    name = "local"
-    repeats = False
-
     def __init__(self, slots: Sequence[WorkerSlot]) -> None:
         self._free = list(slots)
         self._has_gpu = any(slot.gpu is not None for slot in slots)
@@ -251,10 +244,7 @@ class LocalEngine:
 
 
 class Engine(Protocol):
-    """Runs tasks that are ready. ``repeats`` states whether it restarts killed tasks itself."""
-
-    name: str
-    repeats: bool
+    """Runs tasks that are ready, each once."""
 
     def check(self, gpus: int) -> None:
         """Raises ConfigError if a task that needs ``gpus`` GPUs would never run."""
@@ -321,12 +311,11 @@ class TaskQueue:
         for result in self.engine.ended(seconds):
             self._running.remove(result.name)
             task, _ = self._tasks[result.name]
-            if result.killed and not self.engine.repeats and self._attempts[result.name] <= task.retries:
+            if result.killed and self._attempts[result.name] <= task.retries:
                 self._ready.appendleft(result.name)
                 continue
             del self._tasks[result.name]
-            attempts = self._attempts.pop(result.name)
-            results.append(result if self.engine.repeats else replace(result, attempts=attempts))
+            results.append(replace(result, attempts=self._attempts.pop(result.name)))
         self._begin()
         return results
 

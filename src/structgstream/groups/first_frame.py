@@ -195,7 +195,7 @@ def fit_group_start(
     optimizer = FrameOptimizer(
         each, backend, frame_index, torch.Generator().manual_seed(seed), Stopwatch(), steps or {}, on_step
     )
-    rounds = _Rounds(optimizer, start, scene, views, changes, floor)
+    rounds = _Rounds(optimizer, scene, views, changes, floor)
     current, results = with_displacements(scene, displacements), list[FitResult[Scene]]()
     for number in range(start.rounds):
         results.append(rounds.run(current, again=number > 0))
@@ -208,7 +208,6 @@ class _Rounds:
     """State that the rounds of a group's first frame share; ``first`` is frame 0."""
 
     fit: FrameOptimizer
-    start: GroupStartConfig
     first: Scene
     views: list[View]
     changes: list[PictureChange | None]

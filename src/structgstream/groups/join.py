@@ -7,13 +7,12 @@ then. So a run of groups that starts after such a group is independent of other 
 """
 
 import json
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import accumulate
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import cast
 
 from structgstream.atomic_files import atomic_file, atomic_write
@@ -25,14 +24,11 @@ from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, 
 from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
 from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.owned_folders import own_folder, remove_own
 from structgstream.training.online.patching import IDS_PER_FRAME
 
 MAX_GROUPS = 8
 """Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
 POLL_SECONDS = 0.2
-PURPOSE = "hand-over of a join"
-RUNS = re.compile(r"run-\d+(\.partial)?")
 OnBorder = Callable[[Border], None]
 
 
@@ -69,7 +65,7 @@ def join_segments(
     firsts = [0, *accumulate(lengths)][:-1] if backend is None else [0]
     runs = [] if backend is None or workers == 1 else runs_of(lengths, workers=workers)
     if backend is not None and len(runs) > 1:
-        records = _blended_by_workers(ordered, runs, output, backend, workers, on_border or (lambda border: None))
+        records = _blended_by_workers(ordered, runs, backend, workers, on_border or (lambda border: None))
     else:
         blender = None if backend is None else GroupBlender(header_of(init), backend, on_border=on_border)
         records = _records(ordered, blender)
@@ -105,13 +101,14 @@ def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
 
 
 def _blended_by_workers(
-    paths: Sequence[Path], runs: Sequence[range], output: Path, backend: Backend, workers: int, on_border: OnBorder
+    paths: Sequence[Path], runs: Sequence[range], backend: Backend, workers: int, on_border: OnBorder
 ) -> Iterator[bytes]:
     """The records of all groups in order; ``workers`` processes blend the runs."""
     yield from _records(paths[:1], None)
     done = set[str]()
-    with _folder_of_runs(output) as folder, TaskQueue(LocalEngine(allocate_slots(workers=workers, cores=workers))) as q:
-        outputs = [folder / f"run-{number}" for number in range(len(runs))]
+    slots = allocate_slots(workers=workers, cores=workers)
+    with TemporaryDirectory(prefix="structgstream-join-") as folder, TaskQueue(LocalEngine(slots)) as q:
+        outputs = [Path(folder, f"run-{number}") for number in range(len(runs))]
         for run, result in zip(runs, outputs):
             q.submit(run_task(paths[run.start - 1 : run.stop], result, device=backend.name))
         for result in outputs:
@@ -128,18 +125,6 @@ def _blended_by_workers(
                 on_border(border)
             yield from records
             result.unlink()
-
-
-@contextmanager
-def _folder_of_runs(output: Path) -> Iterator[Path]:
-    """A temporary folder next to ``output`` for the results of runs; the remains of a killed join are removed."""
-    folder = output.with_name(f"{output.name}.runs")
-    remove_own(folder, PURPOSE, RUNS)
-    own_folder(folder, PURPOSE)
-    try:
-        yield folder
-    finally:
-        remove_own(folder, PURPOSE, RUNS, whole=True)
 
 
 def run_task(paths: Sequence[Path], output: Path, *, device: str) -> Task:

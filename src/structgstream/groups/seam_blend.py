@@ -159,23 +159,17 @@ CAMERAS = 9
 """Training cameras, at equal distances in the rig, for which the frames around a border are drawn."""
 
 
-def border_cameras(rig: CameraRig) -> tuple[str, ...]:
-    """Names of the cameras for which the frames around a border are drawn."""
-    return rig.training[:: max(1, len(rig.training) // CAMERAS)]
-
-
 @dataclass(frozen=True)
 class BorderPictures:
     """Renderings of the two frames at a border; at 640 x 360 they take 50 MB."""
 
-    # rendering [H, W, 3] of the last frame of the group before, by name of the border_cameras
-    before: Mapping[str, Tensor]
-    first: Mapping[str, Tensor]  # rendering [H, W, 3] of the first frame of the group, by the same names
+    before: Mapping[str, Tensor]  # rendering [H, W, 3] of the last frame of the group before, by camera
+    first: Mapping[str, Tensor]  # rendering [H, W, 3] of the first frame of the group, by camera
 
 
 def draw_border(before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> BorderPictures:
     """Draws the last frame of a group and the first one of the next."""
-    names = border_cameras(rig)
+    names = rig.training[:: max(1, len(rig.training) // CAMERAS)]
     with torch.no_grad():
         then, now = ({name: render(scene, rig[name], backend).image for name in names} for scene in (before, first))
     return BorderPictures(then, now)

@@ -160,8 +160,7 @@ class SegmentSink:
         return 0
 
     def begin(self, header: StreamHeader) -> int:
-        """Not supported: groups share one header. Raises ConfigError always."""
-        raise ConfigError("A group cannot begin another period; leave out --period.")
+        raise AssertionError("groups share one header")
 
     def write(self, packet: Packet) -> int:
         """Appends one packet; returns its size in bytes. Raises StorageError if it cannot be written, or the disk is

@@ -99,7 +99,6 @@ class TrackFile:
         head: what the track was made from.
         starts: the frames at which groups may begin, frame 0 not included.
         groups: ``(first frame, end)`` of the groups that the pass chose; None if it is not finished.
-        end: offset after the last complete start record.
 
     Raises:
         StreamError: the file is not a track, or has another version.
@@ -119,27 +118,24 @@ class TrackFile:
             self.head = TrackHead(**json.loads(head.payload))
         except (TypeError, ValueError) as error:
             raise StreamError(f"The head of the track {name} does not follow the format ({error}).") from error
-        self.end = self._scan(head.end)
+        self._scan(head.end)
 
     @property
     def starts(self) -> list[int]:
         """The frames at which groups may begin, ascending."""
         return [*self._offsets]
 
-    def _scan(self, offset: int) -> int:
+    def _scan(self, offset: int) -> None:
         # Record heads only: the checksum of a start is verified when it is read.
         while (found := read_head(self._data, offset)) is not None:
-            kind, after = found.type, offset + found.bytes
-            if kind == TrackRecord.START and found.length >= START.size:
-                frame = START.unpack(self._data[offset + RECORD.size : offset + RECORD.size + START.size])[0]
-                self._offsets[frame] = offset
-            elif kind == TrackRecord.END and (record := read_record(self._data, offset)) is not None:
-                self.groups = [(first, end) for first, end in json.loads(record.payload)["groups"]]
+            if found.type != TrackRecord.START or found.length < START.size:
                 break
-            else:
-                break
-            offset = after
-        return offset
+            frame = START.unpack(self._data[offset + RECORD.size : offset + RECORD.size + START.size])[0]
+            self._offsets[frame] = offset
+            offset += found.bytes
+        last = read_record(self._data, offset)
+        if last is not None and last.type == TrackRecord.END:
+            self.groups = [(first, end) for first, end in json.loads(last.payload)["groups"]]
 
     def start(self, frame: int) -> TrackStart:
         """The start record of ``frame``. Raises StreamError if the pass has stored no start at this frame, or it is
@@ -190,9 +186,9 @@ class TrackWriter:
         if not keep:
             self._file.append(track_bytes(head))
 
-    def write(self, start: TrackStart) -> int:
-        """Appends a start; returns its size in bytes."""
-        return self._file.append(packed(TrackRecord.START, start.packed()))
+    def write(self, start: TrackStart) -> None:
+        """Appends a start."""
+        self._file.append(packed(TrackRecord.START, start.packed()))
 
     def finish(self, frames: int, groups: Sequence[tuple[int, int]]) -> None:
         """Completes the track and renames it."""

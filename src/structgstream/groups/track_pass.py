@@ -190,9 +190,9 @@ class Pass:
         online, scene = base.config.online, on_device(base.scene(), backend.device)
         rig = base.header.similarity.rig(base.header.rig)
         tracker = Tracker(config, online.motion, rig, backend)
-        if start is None:
-            return cls(scene, tracker, base.position_step, Tracked.at_rest(scene), 0)
-        return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)
+        step = base.position_step
+        tracked = Tracked.at_rest(scene) if start is None else tracked_at(scene, start, step=step)
+        return cls(scene, tracker, step, tracked, 0 if start is None else start.frame)
 
     def start(self, changed: list[float]) -> TrackStart:
         """The start record of the last frame; rounds the state to it."""

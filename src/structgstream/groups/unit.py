@@ -8,7 +8,6 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -97,8 +96,7 @@ class GroupMethod:
         return preprocess(frame, rig, before=first, motion=online.motion, scene_flow=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """Not supported: frame 0 is that of the header. Raises ConfigError always."""
-        raise ConfigError("A group needs a header with frame 0; give one with --init.")
+        raise AssertionError("frame 0 is the header's")
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
         return self._usual.prepare(state, task)
@@ -213,13 +211,11 @@ def fit_segment(
         the run; None if the segment exists, finished and undamaged.
 
     Raises:
-        ConfigError: the range is empty, the existing segment is of another group, or the header has another version.
+        ConfigError: the existing segment is of another group, or the header has another version.
         CaptureError: the capture is not that of the header, or lacks these frames.
         StreamError: header or track is damaged, or the track has no start at the first frame.
         StorageError: the segment cannot be written, or another process writes it.
     """
-    if not 0 <= task.first < task.end:
-        raise ConfigError(f"Frames {task.first}:{task.end} are no group; the first must be from 0 to before the end.")
     base = GroupBase.read(task.header)
     source = open_for(base.header, task.capture, frames=task.end)
     start, captured = _start(task, base), fingerprint(source)
@@ -265,12 +261,8 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
     least = MIN_DISPLACED_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
-
-    @cache
-    def first_pictures() -> MultiViewFrame:
-        return next(denoised(source, base.config.denoising).frames(0))
-
-    return GroupEntry(start.frame, displacements, velocities, first_pictures)
+    pictures = denoised(source, base.config.denoising)
+    return GroupEntry(start.frame, displacements, velocities, lambda: next(pictures.frames(0)))
 
 
 def _remove(path: Path) -> None:

@@ -92,10 +92,8 @@ def serial_seconds(costs: Costs, work: Work) -> float:
 
 
 def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
-    """A run on ``workers``: groups begin in their order, each as soon as a worker is free and the pass has come to it.
-    Raises ConfigError if there is less than one."""
-    if workers < 1:
-        raise ConfigError(f"The number of workers must be 1 or more, got {workers}.")
+    """A run on ``workers``: groups begin in their order, each as soon as a worker is free and the pass has come to
+    it."""
     begin = costs.header_seconds
     tracking = begin + costs.track_start_seconds + work.frames * costs.track_seconds
     free = [tracking, *[begin] * (workers - 1)]  # The pass is a task like others.

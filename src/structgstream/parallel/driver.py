@@ -3,8 +3,8 @@
 start, and the join.
 """
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -19,26 +19,12 @@ from structgstream.executors.tasks import (
     WorkerSlot,
     thread_environment,
 )
-from structgstream.groups.track_file import Groups, groups_path, open_track, read_groups, track_bytes
+from structgstream.groups.track_file import Groups, groups_path, open_track, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
 HEADER, TRACK, JOIN = "header", "track", "join"
 PROGRAM = (PYTHON, "-m", "structgstream")
-
-
-def starts_in(track: Path) -> Collection[int]:
-    """The starts in a file of ``structgstream track``; none before its head is written."""
-    try:
-        return open_track(track).starts
-    except StreamError:
-        return ()
-
-
-def cut_track(track: Path, first: int) -> bytes:
-    """An unfinished track with the start that a group needs. Raises StreamError if it is missing or damaged."""
-    found = open_track(track)
-    return track_bytes(found.head, found.start(first))
 
 
 @dataclass(frozen=True)
@@ -54,10 +40,6 @@ class Unit:
     device: tuple[str, ...] = ()  # further arguments of all commands but join: the back-end
     join: tuple[str, ...] = ()  # further arguments of join, which runs here: the back-end, number of processes
     program: tuple[str, ...] = PROGRAM  # runs the commands
-    # the frames at which a group may start, of a track that is finished or growing
-    starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
-    # extracts from a track what one group needs
-    cut: Callable[[Path, int], bytes] = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
         """Fits frame 0, which all groups share."""
@@ -181,15 +163,13 @@ class _Drive:
         self._executor.submit(self._exchange.track(self._unit.track_task(parts)), gpus=gpus)
         is_tracked = is_lost = False
         while not is_tracked or self._executor.running or self._executor.waiting:
-            if not is_lost:
-                self._submit_groups(is_tracked=is_tracked)
             for result in self._executor.wait(POLL_SECONDS):
                 is_tracked |= result.name == TRACK
                 is_lost |= result.name == TRACK and not result.done
                 self._record(result)
-            if is_tracked and not is_lost:
-                self._submit_groups(is_tracked=True)
-                if not self._groups:
+            if not is_lost:
+                self._submit_groups(is_tracked=is_tracked)
+                if is_tracked and not self._groups:
                     raise TaskError(f"The tracking pass has ended, and there are no groups next to {parts.track}.")
             self._states |= {name: State.RUNNING for name in self._executor.running if name in self._states}
             self._show()
@@ -197,7 +177,7 @@ class _Drive:
             raise TaskError(_sentence(self._failed, parts))
         return self._join()
 
-    def _alone(self, queue: TaskQueue, task: Task, *, gpus: int = 0) -> TaskResult:
+    def _alone(self, queue: TaskQueue, task: Task, *, gpus: int) -> TaskResult:
         """Runs a task that all others depend on, or that depends on them."""
         self._show()
         queue.submit(task, gpus=gpus)
@@ -217,10 +197,10 @@ class _Drive:
             self._states = dict.fromkeys(self._groups, State.UNTRACKED)
             self._stage = "groups" if self._groups else self._stage
         left = [name for name, state in self._states.items() if state is State.UNTRACKED]
-        starts = {0, *self._unit.starts(self._parts.track)} if left and not is_tracked else ()
+        starts = self._starts() if left and not is_tracked else []
         for name in left:
             first = self._groups[name][0]
-            if not is_tracked and first not in starts:
+            if first and not is_tracked and first not in starts:
                 return
             task = self._unit.group_task(self._parts, *self._groups[name])
             if self._parts.is_complete(name, self._key(task), Path(task.result)):
@@ -228,6 +208,13 @@ class _Drive:
             else:
                 self._executor.submit(self._exchange.group(task, first), gpus=self._job.gpus)
                 self._states[name] = State.READY
+
+    def _starts(self) -> list[int]:
+        """The starts in the growing track; none before its head is written."""
+        try:
+            return open_track(self._parts.track).starts
+        except StreamError:
+            return []
 
     def _key(self, task: Task) -> str:
         return key_of(task.command, self._header_key)

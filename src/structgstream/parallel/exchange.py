@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
-from structgstream.errors import ConfigError, StorageError, StructGStreamError
+from structgstream.errors import StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
 from structgstream.executors.tasks import PYTHON, Task, tied_argv
-from structgstream.groups.track_file import groups_path
+from structgstream.groups.track_file import groups_path, open_track, track_bytes
 from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
 from structgstream.parallel.parts import PART_NAMES, Parts
 from structgstream.remote_folders import open_url, reason_of, shown_address
@@ -148,8 +148,8 @@ class SharedFolder:
 class ObjectStore(SharedFolder):
     """Parts are exchanged through an object store; the driver has copies."""
 
-    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: Callable[[Path, int], bytes]) -> None:
-        self._store, self._parts, self._cut = store, parts, cut
+    def __init__(self, store: ObjectFolder, parts: Parts) -> None:
+        self._store, self._parts = store, parts
         self._asked = 0.0
         self._fetched_bytes: int | None = None  # of the growing track
 
@@ -164,8 +164,9 @@ class ObjectStore(SharedFolder):
     def group(self, task: Task, first: int) -> Task:
         track = self._parts.track.with_name(f"start-{first:06d}.sgt")
         command = tuple(argument.replace(str(self._parts.track), str(track)) for argument in task.command)
-        if first:
-            self._store.write(self._name(partial_path(track)), self._cut(self._parts.track, first))
+        if first:  # The machine gets an unfinished track with the one start that the group needs.
+            whole = open_track(self._parts.track)
+            self._store.write(self._name(partial_path(track)), track_bytes(whole.head, whole.start(first)))
         segment = Path(task.result)
         return self._staged(
             replace(task, command=command),
@@ -281,9 +282,7 @@ class Staging:
 
 def run(transfer: Transfer, command: Sequence[str]) -> int:
     """Fetches inputs, runs the command and stores outputs; returns its status."""
-    url = os.environ.get(STORE)
-    if not url:
-        raise ConfigError(f"The variable {STORE} has no URL of a store.")
+    url = os.environ[STORE]
     staging = Staging(ObjectFolder(url), scratch_folder(transfer, url))
     for name in transfer.needs:
         staging.fetch(name, replace=True)

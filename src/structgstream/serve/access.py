@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access tokens, ``v1.EXPIRES.SIGNATURE.STREAM``, and the check of a request's query and token.
+"""Access tokens, ``v1.EXPIRES.SIGNATURE.STREAM``, and the check of a request's token.
 
 Note [Tokens]
 ~~~~~~~~~~~~~
@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from urllib.parse import parse_qsl
 
 from structgstream.errors import ConfigError
 from structgstream.serve.streams import is_stream_name
@@ -29,21 +28,19 @@ if TYPE_CHECKING:
 
 EVERY_STREAM: Final = "~"
 MIN_SECRET_BYTES: Final = 32
-MAX_SECRET_FILE_BYTES: Final = 64 * 1024
-MAX_TOKEN_BYTES: Final = 256
 
 _TOKEN = re.compile(r"v1\.([0-9]{1,12})\.([A-Za-z0-9_-]{43})\.([A-Za-z0-9._~-]{1,128})", re.ASCII)
 _CONTEXT = b"structgstream access token v1\0"
 
 
 class Access(Enum):
-    """The result of checking a token for a stream."""
+    """The result of checking a token for a stream; of a refusal, its sentence."""
 
-    GRANTED = "granted"
-    MISSING = "no token"
-    FORGED = "not a token of this server"
-    EXPIRED = "expired"
-    OTHER_STREAM = "for another stream"
+    GRANTED = ""
+    MISSING = "An access token is needed here."
+    FORGED = "The access token is not one of this server."
+    EXPIRED = "The access token has expired."
+    OTHER_STREAM = "The access token is for another stream."
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ class TokenKeys:
         """Check ``token`` for a stream at a time; its other parts are parsed only if the signature is valid."""
         if not token:
             return Access.MISSING
-        found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN_BYTES else None
+        found = _TOKEN.fullmatch(token)
         if found is None:
             return Access.FORGED
         expires, signature, name = int(found[1]), found[2].encode(), found[3]
@@ -91,12 +88,9 @@ def read_keys(path: Path) -> TokenKeys:
     be guessed."""
     advice = f"make one with: (umask 077; openssl rand -hex 32 > {path})"
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_SECRET_FILE_BYTES + 1)
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"The secret file {path} cannot be read ({error.strerror}); {advice}.") from None
-    if len(content) > MAX_SECRET_FILE_BYTES:
-        raise ConfigError(f"The secret file {path} has over {MAX_SECRET_FILE_BYTES} bytes; expected a secret a line.")
     secrets = tuple(line.strip() for line in content.splitlines() if line.strip())
     if not secrets:
         raise ConfigError(f"The secret file {path} is empty; {advice}.")
@@ -108,16 +102,7 @@ def read_keys(path: Path) -> TokenKeys:
     return TokenKeys(secrets)
 
 
-MAX_PARAMETERS: Final = 16
-_NUMBER = re.compile(r"[0-9]{1,16}", re.ASCII)
 _BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)
-_CHALLENGE = {"WWW-Authenticate": 'Bearer realm="structgstream"'}
-_REASONS: Mapping[Access, str] = {
-    Access.MISSING: "An access token is needed here.",
-    Access.FORGED: "The access token is not one of this server.",
-    Access.EXPIRED: "The access token has expired.",
-    Access.OTHER_STREAM: "The access token is for another stream.",
-}
 
 
 class Refused(Exception):
@@ -130,34 +115,10 @@ class Refused(Exception):
         self.headers = headers or {}
 
 
-@dataclass(frozen=True)
-class Query:
-    """The query parameters that the server knows; others are ignored."""
-
-    token: str | None  # access token; None if there is none
-    after: int | None  # sequence of the manifest that the client has; None if it does not wait for a newer one
-
-
-def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
-    """The query of a request as the client wrote it; a token in the header ``Authorization`` takes precedence. Raises
-    Refused if it has too many parameters, one of them twice, or ``after`` is not a number."""
-    try:
-        pairs = parse_qsl(raw.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS, errors="strict")
-    except ValueError:  # also for bytes that are not UTF-8
-        raise Refused(400, f"The query cannot be read, or has more than {MAX_PARAMETERS} parameters.") from None
-    values = dict(pairs)
-    for name in ("token", "after"):
-        if sum(key == name for key, _ in pairs) > 1:
-            raise Refused(400, f"The query has {name} twice.")
-    if not _NUMBER.fullmatch(values.get("after", "0")):
-        raise Refused(400, "The query's after is not a sequence number.")
-    bearer = _BEARER.fullmatch(headers.get("authorization", ""))
-    return Query(bearer[1] if bearer else values.get("token"), int(values["after"]) if "after" in values else None)
-
-
-def query_of(request: "Request") -> Query:
-    """The query of a request. Raises Refused if it is malformed."""
-    return parsed_query(request.scope["query_string"], request.headers)
+def token_of(request: "Request") -> str | None:
+    """The token of a request: the one in its header ``Authorization``, else in its query; None if there is none."""
+    bearer = _BEARER.fullmatch(request.headers.get("authorization", ""))
+    return bearer[1] if bearer else request.query_params.get("token")
 
 
 class Authorizer:
@@ -168,27 +129,25 @@ class Authorizer:
         self._clock = clock
 
     def access(self, request: "Request", name: str) -> Access:
-        """Access of a request to the stream ``name``. Raises Refused if the query is malformed."""
-        query = query_of(request)
+        """Access of a request to the stream ``name``."""
         if self._keys is None:
             return Access.GRANTED
-        return self._keys.access(query.token, name, unix_seconds=self._clock())
+        return self._keys.access(token_of(request), name, unix_seconds=self._clock())
 
     def check(self, request: "Request", name: str) -> None:
-        """Check that a request has access to the stream ``name``. Raises Refused if it has none, or the query is
-        malformed."""
+        """Check that a request has access to the stream ``name``. Raises Refused if it has none."""
         access = self.access(request, name)
         if access is not Access.GRANTED:
             raise refusal(access)
 
     def page_query(self, request: "Request") -> str:
         """The query that a page adds to the addresses it loads: the token of its own request, if one is needed."""
-        token = query_of(request).token
+        token = token_of(request)
         return f"?token={token}" if self._keys is not None and token else ""
 
 
 def refusal(access: Access) -> Refused:
     """The answer to a request without access."""
     if access is Access.OTHER_STREAM:
-        return Refused(403, _REASONS[access])
-    return Refused(401, _REASONS[access], _CHALLENGE)
+        return Refused(403, access.value)
+    return Refused(401, access.value, {"WWW-Authenticate": 'Bearer realm="structgstream"'})

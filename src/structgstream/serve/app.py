@@ -12,6 +12,7 @@ docs/serve.md lists the addresses. The reverse proxy in front bounds connections
 """
 
 import asyncio
+import re
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
@@ -28,11 +29,12 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
 from structgstream.errors import StreamError
-from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, query_of, refusal
+from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
 from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
@@ -40,7 +42,6 @@ from structgstream.serve.pages import SERVED_POLICY, bundle, linked_page, list_p
 from structgstream.serve.responses import NO_STORE_HEADERS, content_response, file_response
 from structgstream.serve.streams import (
     Catalog,
-    OpenedFile,
     ServedStream,
     StreamKind,
     hash_in_name,
@@ -56,6 +57,7 @@ METHODS: Final = ("GET", "HEAD", "OPTIONS")
 REQUEST_HEADERS: Final = ("Authorization", "Range", "If-Range", "If-None-Match")
 EXPOSED_HEADERS: Final = ("ETag", "Content-Range", "Content-Length", "Accept-Ranges")
 _PICTURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+_SEQUENCE: Final = re.compile(r"[0-9]{1,16}", re.ASCII)
 _NOTHING_HERE: Final = "There is nothing at this address."
 
 
@@ -114,6 +116,7 @@ class _Routes:
         self._clock = clock
         self._wait_seconds = settings.wait_seconds
         self._visibility = "public" if settings.keys is None else "private"
+        self._revalidated = "no-cache" if settings.keys is None else "private, no-cache"  # content that changes
         shared = "cross-origin" if settings.origins else "same-origin"
         self._headers = {**NO_STORE_HEADERS, "Cross-Origin-Resource-Policy": shared}
         self._module = bundle()
@@ -240,15 +243,10 @@ class _Routes:
         headers = {**self._headers, "Cache-Control": self._revalidated}
         return content_response(content, request, headers, media_type="application/json")
 
-    @property
-    def _revalidated(self) -> str:
-        """``Cache-Control`` of content that changes."""
-        return "no-cache" if self._visibility == "public" else "private, no-cache"
-
     async def _manifest(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "manifest")
         self._metrics.viewers.see(stream.name, request.scope.get("client"))
-        watch, after = self._manifests.watch(stream), query_of(request).after
+        watch, after = self._manifests.watch(stream), _after(request)
         if after is None or request.method == "HEAD":
             found = await watch.current()
         else:
@@ -298,7 +296,15 @@ def _check_plain(request: Request) -> None:
         raise Refused(404, _NOTHING_HERE)
 
 
-def _open_preview(stream: ServedStream) -> OpenedFile | None:
+def _after(request: Request) -> int | None:
+    """The sequence of the manifest that the client has; None if it does not wait for a newer one."""
+    given = request.query_params.get("after", "0")
+    if not _SEQUENCE.fullmatch(given):
+        raise Refused(400, "The query's after is not a sequence number.")
+    return int(given) if "after" in request.query_params else None
+
+
+def _open_preview(stream: ServedStream) -> FileBytes | None:
     for suffix in (".png", ".jpg"):
         segments = stream.segments[-1:]  # the best of several renditions
         opened = segments[0].open(f"preview{suffix}") if segments else stream.open_beside(f".preview{suffix}")
@@ -315,7 +321,7 @@ def _run_numbers(stream: ServedStream) -> dict[str, float]:
         return run_numbers(opened[:MAX_RUN_BYTES])
 
 
-async def _content(opened: OpenedFile | None, max_bytes: int) -> bytes | None:
+async def _content(opened: FileBytes | None, max_bytes: int) -> bytes | None:
     """The content of a small file; None if there is no file, or it is larger."""
     if opened is None:
         return None

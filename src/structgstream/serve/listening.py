@@ -5,7 +5,7 @@ import ipaddress
 import os
 import socket
 import webbrowser
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -120,7 +120,7 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
             server.run(sockets=[listening])
 
 
-def open_browser(address: str, *, environ: Mapping[str, str] = os.environ) -> bool:
+def open_browser(address: str) -> bool:
     """Opens ``address``; returns False without a screen, because a text browser would use the terminal."""
-    graphical = any(environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    graphical = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     return graphical and webbrowser.open(address)

@@ -3,9 +3,7 @@
 
 Note [One watcher]
 ~~~~~~~~~~~~~~~~~~
-While requests wait, one task per stream calls stat on the manifest ten times a second; other requests use its result.
-The file is read when its stat has changed. A stat younger than the resolution of the file system's clock is not
-trusted, because the file may be replaced again within the same tick.
+While requests wait, one task per stream reads the manifest ten times a second; other requests use its result.
 """
 
 import asyncio
@@ -17,13 +15,12 @@ from typing import Final
 
 from anyio import to_thread
 
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.segments.manifest import FORMAT, MANIFEST, MAX_MANIFEST_BYTES, Fields, parse_object
 from structgstream.errors import StreamError
-from structgstream.serve.streams import FileStamp, OpenedFile, ServedStream
+from structgstream.serve.streams import ServedStream
 
 POLL_SECONDS: Final = 0.1
-TICK_NS: Final = 100_000_000
-"""Minimum age of a trusted stat."""
 
 
 class BrokenManifest(Exception):
@@ -51,13 +48,12 @@ class ManifestWatch:
     """The manifest of one stream (Note [One watcher])."""
 
     def __init__(
-        self, open_file: Callable[[], OpenedFile | None], *, clock: Callable[[], float] = time.monotonic
+        self, open_file: Callable[[], FileBytes | None], *, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._open_file = open_file
         self._clock = clock
         self._lock = asyncio.Lock()
         self._read_at = -float("inf")
-        self._stamp: FileStamp | None = None
         self._found: Snapshot | str | None = None  # a string is the error in the manifest
         self._changed = asyncio.Event()
         self._watching: asyncio.Task[None] | None = None
@@ -112,27 +108,25 @@ class ManifestWatch:
         """Read the file if it has changed, and wake waiting requests."""
         before = self._found
         try:
-            self._stamp, self._found = await to_thread.run_sync(self._read)
+            self._found = await to_thread.run_sync(self._read)
         except BrokenManifest as broken:
-            self._stamp, self._found = None, str(broken)
+            self._found = str(broken)
         self._read_at = self._clock()
-        if self._found is not before and self._found != before:
+        if self._found != before:
             changed, self._changed = self._changed, asyncio.Event()
             changed.set()
 
-    def _read(self) -> tuple[FileStamp | None, Snapshot | str | None]:
+    def _read(self) -> Snapshot | None:
         opened = self._open_file()
         if opened is None:
-            return None, None
+            return None
         with opened as file:
-            if file.stamp == self._stamp:
-                return self._stamp, self._found
             if len(file) > MAX_MANIFEST_BYTES:
                 raise BrokenManifest(f"{MANIFEST} has {len(file)} bytes; expected at most {MAX_MANIFEST_BYTES}.")
             content = file[:]
-        sure = time.time_ns() - file.stamp.modified_ns > TICK_NS
-        same = isinstance(self._found, Snapshot) and self._found.content == content
-        return file.stamp if sure else None, self._found if same else snapshot(content)
+        if isinstance(self._found, Snapshot) and self._found.content == content:
+            return self._found
+        return snapshot(content)
 
 
 def snapshot(content: bytes) -> Snapshot:

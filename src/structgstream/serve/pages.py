@@ -68,20 +68,15 @@ REFRESH_SECONDS: Final = 60
 _NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>"
 
 
-def bundle_path() -> Path:
-    """The file ``player.js``. Raises PlayerError if the installation lacks it."""
-    path = Path(str(files("structgstream.serve") / "assets" / "player.js"))
+def bundle() -> str:
+    """The module's source. Raises PlayerError if the installation lacks it."""
+    path = files("structgstream.serve") / "assets" / "player.js"
     if not path.is_file():
         raise PlayerError(
             "The player is missing from the installation; reinstall structgstream, or, in a clone, run "
             "scripts/build-player."
         )
-    return path
-
-
-def bundle() -> str:
-    """The module's source. Raises PlayerError if the installation lacks it."""
-    return bundle_path().read_text(encoding="utf-8")
+    return path.read_text(encoding="utf-8")
 
 
 def policy(**sources: str) -> str:

@@ -9,8 +9,8 @@ to read it; and URLs name cameras and frames, never files.
 """
 
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator
+from functools import lru_cache
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -28,7 +28,7 @@ from structgstream.serve.pages import SERVED_POLICY, StreamFile, bundle, linked_
 from structgstream.serve.responses import NO_STORE_HEADERS, file_response
 
 JPEG_QUALITY = 95
-MAX_CACHED_BYTES = 64 * 10**6
+MAX_CACHED = 64  # pictures, of about a megabyte each at 1920 x 1080
 MAX_SKIPPED = 8  # decoding and skipping up to this many frames costs less than seeking in reopened videos
 
 
@@ -40,18 +40,14 @@ class Truth:
     MissingExtraError without OpenCV, which encodes pictures.
     """
 
-    def __init__(
-        self, source: FrameSource, cameras: tuple[str, ...], *, max_cached_bytes: int = MAX_CACHED_BYTES
-    ) -> None:
+    def __init__(self, source: FrameSource, cameras: tuple[str, ...]) -> None:
         self.cameras = cameras
         self.frames = len(source)
         self._source = source
         self._cv2 = opencv()
         self._lock = threading.Lock()
         self._open: tuple[str, int, Iterator[MultiViewFrame]] | None = None
-        self._cache: OrderedDict[tuple[str, int], bytes] = OrderedDict()
-        self._max_bytes = max_cached_bytes
-        self.cached_bytes = 0
+        self._cached = lru_cache(MAX_CACHED)(self._encoded)
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
         """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it. Raises
@@ -59,20 +55,7 @@ class Truth:
         if camera not in self.cameras or not 0 <= frame < self.frames:
             return None
         with self._lock:
-            picture = self._cache.get((camera, frame))
-            if picture is None:
-                picture = self._encoded(camera, frame)
-                if picture is None:
-                    return None
-                self._store((camera, frame), picture)
-            self._cache.move_to_end((camera, frame))
-            return picture
-
-    def _store(self, key: tuple[str, int], picture: bytes) -> None:
-        self._cache[key] = picture
-        self.cached_bytes += len(picture)
-        while self.cached_bytes > self._max_bytes and len(self._cache) > 1:
-            self.cached_bytes -= len(self._cache.popitem(last=False)[1])
+            return self._cached(camera, frame)
 
     def _encoded(self, camera: str, frame: int) -> bytes | None:
         image = self._at(camera, frame).images.get(camera)

@@ -60,25 +60,7 @@ def is_plain_path(raw: bytes) -> bool:
     return _PATH.fullmatch(raw) is not None and not {b".", b".."} & set(raw.split(b"/"))
 
 
-@dataclass(frozen=True)
-class FileStamp:
-    """Properties of a file that change when it is replaced or grows."""
-
-    inode: int
-    modified_ns: int
-    size_bytes: int
-
-
-class OpenedFile(FileBytes):
-    """A regular file at its length when it was opened."""
-
-    def __init__(self, handle: int, name: str) -> None:
-        super().__init__(handle, name=name)
-        status = os.fstat(handle)
-        self.stamp = FileStamp(status.st_ino, status.st_mtime_ns, status.st_size)
-
-
-def open_below(folder: Path, *parts: str) -> OpenedFile | None:
+def open_below(folder: Path, *parts: str) -> FileBytes | None:
     """The regular file ``folder/parts[0]/...``; None if there is none that may be read (Note [No links]). The folder
     may itself be a link, because the user named it. Raises OSError if the system cannot open files now."""
     try:
@@ -88,7 +70,7 @@ def open_below(folder: Path, *parts: str) -> OpenedFile | None:
             return None
         raise
     if stat.S_ISREG(os.fstat(handle).st_mode):
-        return OpenedFile(handle, parts[-1])
+        return FileBytes(handle, name=parts[-1])
     os.close(handle)
     return None
 
@@ -141,15 +123,15 @@ class ServedStream:
             return (self,)
         return tuple(ServedStream(self.root, f"{self.name}/{one}", StreamKind.SEGMENTS) for one in self.renditions)
 
-    def open(self, file: str) -> OpenedFile | None:
+    def open(self, file: str) -> FileBytes | None:
         """A file of its folder; None if there is none."""
         return open_below(self.root, *self.name.split("/"), file)
 
-    def open_whole(self) -> OpenedFile | None:
+    def open_whole(self) -> FileBytes | None:
         """The file of a stream that is one file; None if it has been removed."""
         return open_below(self.root, self.name)
 
-    def open_beside(self, suffix: str) -> OpenedFile | None:
+    def open_beside(self, suffix: str) -> FileBytes | None:
         """The side file of the stream with this suffix; None if there is none."""
         *folders, own = self.name.split("/")
         return open_below(self.root, *folders, side_path(Path(own), suffix).name)
@@ -217,7 +199,7 @@ def _stream(root: Path, entry: "os.DirEntry[str]") -> ServedStream | None:
 
 def _in_folder(root: Path, name: str) -> ServedStream | None:
     """The stream that is the folder ``name``: of segments, or of renditions as soon as all have a manifest."""
-    if _has_manifest(root / name):
+    if _opens(root, name, MANIFEST):
         return ServedStream(root, name, StreamKind.SEGMENTS)
     try:
         folders = _renditions(root, name)
@@ -242,10 +224,3 @@ def _opens(root: Path, *parts: str) -> bool:
     if opened is not None:
         opened.close()
     return opened is not None
-
-
-def _has_manifest(folder: Path) -> bool:
-    try:
-        return stat.S_ISREG((folder / MANIFEST).lstat().st_mode)
-    except OSError:
-        return False
