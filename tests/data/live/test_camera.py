@@ -90,7 +90,6 @@ def camera_feed(
         receiver=received,
         clock=clock(base),
         faults=faults,
-        base=base,
         now=lambda: next(ticks) * PERIOD / 2,
         unix_offset=1000.0,
         silent_seconds=5.0,

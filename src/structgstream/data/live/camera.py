@@ -104,7 +104,7 @@ class ClockMapper:
     """
 
     def __init__(self, base: TimeBase, *, resets: ClockResets, offset_seconds: float = 0.0) -> None:
-        self._base, self._resets, self._offset = base, resets, offset_seconds
+        self.base, self._resets, self._offset = base, resets, offset_seconds
         self._delay = MinimumDelayFilter()
         self._stamp: float | None = None
         self._seconds = -float("inf")
@@ -114,7 +114,7 @@ class ClockMapper:
     @property
     def shift(self) -> float:
         """What is added to a stamp as it comes, to get the time on the common clock; seconds."""
-        shift = self._delay.value if self._base is TimeBase.ARRIVAL else self._shift
+        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
         return self._wrapped + shift + self._offset
 
     def reconnect(self) -> None:
@@ -143,7 +143,7 @@ class ClockMapper:
         return self._mapped(stamp)
 
     def _first(self, stamp: float, arrived: float, wrap_seconds: float | None) -> PictureTime:
-        if self._base is TimeBase.UNIX and wrap_seconds is not None:
+        if self.base is TimeBase.UNIX and wrap_seconds is not None:
             self._shift = round((arrived - stamp) / wrap_seconds) * wrap_seconds
         self._delay.restart(arrived - stamp, arrived)
         return self._mapped(stamp)
@@ -151,7 +151,7 @@ class ClockMapper:
     def _after_reset(self, stamp: float, delay: float, arrived: float) -> PictureTime:
         """The pictures continue with the delay that they had before the reset."""
         correction = delay - self._delay.value
-        if self._base is not TimeBase.ARRIVAL:
+        if self.base is not TimeBase.ARRIVAL:
             common = self._resets.common(correction)
             self._shift += common
             # The minimum delay of this camera is the one before, by the clock as it is now.
@@ -161,7 +161,7 @@ class ClockMapper:
 
     def _mapped(self, stamp: float) -> PictureTime:
         self._stamp = stamp
-        shift = self._delay.value if self._base is TimeBase.ARRIVAL else self._shift
+        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
         seconds = stamp + shift + self._offset
         if seconds <= self._seconds:
             return PictureTime(None, Fault.REORDERED)
@@ -223,7 +223,6 @@ class CameraFeed:
         receiver: Receiver,
         clock: ClockMapper,
         faults: FaultLog,
-        base: TimeBase,
         now: Callable[[], float],
         unix_offset: float,
         silent_seconds: float,
@@ -234,7 +233,7 @@ class CameraFeed:
         sound: LiveSound | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
-        self._receiver, self._clock, self._faults, self._base = receiver, clock, faults, base
+        self._receiver, self._clock, self._faults = receiver, clock, faults
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
         self._recorder, self._sound = recorder, sound
@@ -453,7 +452,7 @@ class CameraFeed:
         """The stamp to use for a picture without one; None if the picture must not be used."""
         self._faults.count(self.name, Fault.NO_STAMP)
         self._unstamped += 1
-        if self._base is not TimeBase.ARRIVAL:
+        if self._clock.base is not TimeBase.ARRIVAL:
             text = 'sends pictures without time stamps; take clock = "arrival" for this rig if all are'
             self._faults.warn(self.name, Fault.NO_STAMP.value, text)
             return None

@@ -3,9 +3,8 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
 
-from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets, OpenCamera
+from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.sound import LiveSound
@@ -65,7 +64,6 @@ class Ingest:
         fps: maximum number of sets per second.
         now: monotonic seconds.
         unix_offset: Unix time minus ``now``, seconds.
-        open_camera: opens a camera with a timeout; None for PyAV.
         sound: receives the sound of the camera that it names; None for none.
     """
 
@@ -80,7 +78,6 @@ class Ingest:
         recording: Recording | None,
         now: Callable[[], float],
         unix_offset: float,
-        open_camera: OpenCamera | None = None,
         sound: LiveSound | None = None,
     ) -> None:
         self._rig, self._faults, self.buffer, self._now = rig, faults, buffer, now
@@ -100,19 +97,20 @@ class Ingest:
         self.sets = 0
         self.small_sets = 0  # with pictures of too few training cameras for a frame
         resets = ClockResets()
-        common: dict[str, Any] = {
-            "receiver": self, "faults": faults, "base": rig.clock, "now": now, "unix_offset": unix_offset,
-            "silent_seconds": rig.silent_seconds, "stuck_seconds": rig.stuck_seconds, "open_camera": open_camera,
-        }  # fmt: skip
         self.feeds = {
             name: CameraFeed(
                 name,
                 camera,
                 size=sizes[name],
+                receiver=self,
                 clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
+                faults=faults,
+                now=now,
+                unix_offset=unix_offset,
+                silent_seconds=rig.silent_seconds,
+                stuck_seconds=rig.stuck_seconds,
                 recorder=None if recording is None else recording.camera(name, faults),
                 sound=sound if sound is not None and sound.name == name else None,
-                **common,
             )
             for name, camera in rig.cameras.items()
         }
