@@ -414,12 +414,10 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
         return srgb(frame, *rest, width=width, height=height)
 
     monkeypatch.setattr(source_module, "srgb", converted)
-    sizes = {"a": (128, 96), "b": (64, 48), "c": (128, 96)}
-    monkeypatch.setattr(source_module, "filmed_sizes", lambda calibration: sizes)
-    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(frames=0))
-    convert = source._converter()
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs")
+    source._sizes["b"] = 64, 48
     pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
-    assert [*convert(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
+    assert [*source._converted(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
     assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
     assert source.faults.counts["b"] == {"garbage": 1}
 

@@ -10,54 +10,14 @@ from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
-from structgstream.frames import MultiViewFrame
 
 TICK_SECONDS = 0.02
 MAX_MISSED_SETS = 30  # before a camera is reported as out of step
 JOIN_SECONDS = 1.0
 
 
-class FrameBuffer:
-    """Holds the newest set of pictures until it is taken; a newer one replaces it. Thread-safe.
-
-    ``convert`` makes the frame of a set: sRGB pictures, and the presentation time on the common clock.
-    """
-
-    def __init__(self, convert: Callable[[PictureSet], MultiViewFrame]) -> None:
-        self._convert = convert
-        self._newest: PictureSet | None = None
-        self._changed = threading.Condition()
-        self.skipped = 0
-        """Number of sets that were replaced by a newer one."""
-        self.times: tuple[float, float] | None = None
-        """When the last picture of the set that was taken last arrived, and when it was complete; monotonic seconds."""
-
-    def put(self, pictures: PictureSet) -> None:
-        """Stores a set."""
-        with self._changed:
-            self.skipped += self._newest is not None
-            self._newest = pictures
-            self._changed.notify()
-
-    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
-        """The next frame; None if there was none in time."""
-        with self._changed:
-            if self._newest is None:
-                self._changed.wait(timeout_seconds)
-            pictures, self._newest = self._newest, None
-        if pictures is None:
-            return None
-        self.times = pictures.arrived, pictures.matched
-        return self._convert(pictures)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no set waits."""
-        return self._newest is None
-
-
 class Ingest:
-    """Cameras' pictures on their way to a buffer, as complete sets.
+    """Cameras' pictures as complete sets, of which the newest waits until it is taken.
 
     Args:
         sizes: width and height of each camera's pictures as they were calibrated, pixels.
@@ -74,13 +34,12 @@ class Ingest:
         sizes: Mapping[str, tuple[int, int]],
         fps: float,
         faults: FaultLog,
-        buffer: FrameBuffer,
         recording: Recording | None,
         now: Callable[[], float],
         unix_offset: float,
         sound: LiveSound | None = None,
     ) -> None:
-        self._rig, self._faults, self.buffer, self._now = rig, faults, buffer, now
+        self._rig, self._faults, self._now = rig, faults, now
         self._synchronizer = FrameSynchronizer(
             sizes,
             fps=fps,
@@ -94,8 +53,10 @@ class Ingest:
         self._stop = threading.Event()
         self._last_arrival = now()
         self._failure: BaseException | None = None
+        self._newest: PictureSet | None = None
+        self._complete = threading.Condition()
         self.sets = 0
-        self.small_sets = 0  # with pictures of too few training cameras for a frame
+        self.skipped_sets = 0  # replaced by a newer one before they were taken
         resets = ClockResets()
         self.feeds = {
             name: CameraFeed(
@@ -129,6 +90,14 @@ class Ingest:
             feed.stop()
         for thread in (self._thread, *self.feeds.values()):
             thread.join(JOIN_SECONDS)
+
+    def take(self, timeout_seconds: float) -> PictureSet | None:
+        """The newest set that was not taken yet; None if there was none in time."""
+        with self._complete:
+            if self._newest is None:
+                self._complete.wait(timeout_seconds)
+            pictures, self._newest = self._newest, None
+        return pictures
 
     def deliver(self, camera: str, picture: LivePicture) -> None:
         """See ``camera.Receiver``."""
@@ -173,7 +142,7 @@ class Ingest:
         """
         if self._failure is not None:
             raise self._failure
-        if not self.buffer.is_empty:
+        if self._newest is not None:
             return None
         if not self.open_cameras and not any(self.queue_lengths.values()):
             return "all files of cameras have come to their end, or cannot be read"
@@ -197,8 +166,11 @@ class Ingest:
                         self._changed.wait(TICK_SECONDS)
                         continue
                     out_of_step = self._synchronizer.out_of_step(MAX_MISSED_SETS)
-                self.sets += 1
-                self.buffer.put(pictures)
+                with self._complete:
+                    self.sets += 1
+                    self.skipped_sets += self._newest is not None
+                    self._newest = pictures
+                    self._complete.notify()
                 self._warn_out_of_step(out_of_step)
         except BaseException as error:  # raised in the trainer's thread
             self._failure = error
