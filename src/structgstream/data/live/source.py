@@ -214,11 +214,9 @@ class LiveSource:
         config, deadline = self._options.denoising, time.monotonic() + MAX_DENOISING_SECONDS
 
         def following() -> Iterator[MultiViewFrame]:
-            count = 0
-            while count < config.frames - 1 and not self.stopped and time.monotonic() < deadline:
+            while not self.stopped and time.monotonic() < deadline:
                 ended = ingest.end_reason
                 if (found := self._taken(ingest)) is not None:
-                    count += 1
                     yield found
                 elif ended:
                     return
