@@ -44,7 +44,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Run, RunMetrics, Storage, log_reports, with_sound
+from structgstream.recorder import Run, RunMetrics, Storage, logged, with_sound
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
@@ -352,13 +352,13 @@ def record_qualities(
         # Frames are denoised below, once for all qualities.
         pipeline = replace(stream_pipeline(own), method=SharedMethod(own, shared=work), denoising=DenoisingConfig())
         opened.append(_Opened(quality.name, pipeline, sink, stored))
-    starts, firsts = [one.start for one in opened], [one.first for one in opened]
     shown = read_ahead(denoised(source, config.denoising))
-    frames = SharedFrames(shown, starts=starts, first=firsts)
+    frames = SharedFrames(shown, starts=[one.start for one in opened], first=[one.first for one in opened])
     reports = {}
     for one, reader in zip(opened, frames.readers, strict=True):
         session = Session(reader, one.sink, one.pipeline, backend, resumed=one.stored, metadata=stated, on_step=on_step)
-        reports[one.name] = log_reports(session.run(), folder / one.name, done=one.done)
+        begin_log(folder / one.name, frames=one.done)
+        reports[one.name] = logged(session.run(), folder / one.name)
     done = {one.name: one.done for one in opened}
     rates, least = BitRates(folder, qualities), min(done.values())
     rates.begin(resume=resume)

@@ -99,21 +99,15 @@ def record(
         sink, metadata = with_sound(sink, metadata, sound, source=source, resumed=resumed)
     session = Session(read_ahead(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
-    return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
-
-
-def log_reports(
-    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
-) -> Generator[FrameReport, None, None]:
-    """The reports of a session, each written to the log next to ``path`` before it is yielded; lines of the ``done``
-    existing frames are retained. Raises StorageError if the log cannot be written."""
     begin_log(path, frames=done)
-    return _append_reports(reports, path, remarks)
+    return Run(done, logged(session.run(), path, remarks))
 
 
-def _append_reports(
-    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None
+def logged(
+    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
+    """The reports of a session, each appended to the log next to ``path``, which was begun, before it is yielded.
+    Raises StorageError if the log cannot be written."""
     with closing(reports):
         for report in reports:
             further = {} if remarks is None else remarks(report)
