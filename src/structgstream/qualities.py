@@ -18,9 +18,8 @@ those of separate runs. Qualities fit a frame one after the other, so only the l
 
 import math
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -180,38 +179,27 @@ PICTURES_KEPT = 3
 
 
 class Once(Generic[Value]):
-    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe."""
+    """The last ``most`` values, each computed at its first request, one at a time. Thread-safe."""
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._found: OrderedDict[Hashable, Future[Value]] = OrderedDict()
+        self._found: dict[Hashable, Value] = {}
         self._lock = threading.Lock()
 
     def value(self, key: Hashable, make: Callable[[], Value]) -> tuple[Value, bool]:
-        """The value of ``key``, and whether it was computed now. All waiting requests receive an error of ``make``."""
+        """The value of ``key``, and whether it was computed now."""
         with self._lock:
-            found = self._found.get(key)
-            mine = found is None
-            if found is None:
-                found = self._found[key] = Future()
-                while len(self._found) > self._most:
-                    self._found.popitem(last=False)
-        if mine:
-            try:
-                found.set_result(make())
-            except BaseException as error:
-                found.set_exception(error)
-                self._forget(key)
-        return found.result(), mine
+            if key in self._found:
+                return self._found[key], False
+            while len(self._found) >= self._most:
+                del self._found[next(iter(self._found))]
+            value = self._found[key] = make()
+            return value, True
 
     def clear(self) -> None:
         """Removes all values."""
         with self._lock:
             self._found.clear()
-
-    def _forget(self, key: Hashable) -> None:
-        with self._lock:
-            self._found.pop(key, None)
 
 
 @dataclass(frozen=True)
