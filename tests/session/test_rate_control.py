@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from structgstream.codec.packets import PacketKind
-from structgstream.errors import ConfigError
 from structgstream.session.periods import MIN_FRAMES, KeyFrames
 from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
@@ -167,12 +166,6 @@ def test_what_is_pressed() -> None:
     assert after.spawn.rules.missing_threshold == 2.0 * before.spawn.rules.missing_threshold
     assert after.spawn.thin_rules.missing_threshold == 2.0 * before.spawn.thin_rules.missing_threshold
     assert with_rate_control(before, 0.25).spawn == before.spawn, "more bits do not spawn noise"
-
-
-@pytest.mark.parametrize("target_mbits", [0.0, -1.0])
-def test_a_target_is_positive(target_mbits: float) -> None:
-    with pytest.raises(ConfigError, match="it must be positive"):
-        RateController(RateConfig(target_mbits), FPS, keys=KeyFrames(KEY_EVERY, FPS))
 
 
 def left_out(seconds: float) -> Callable[[int], float]:

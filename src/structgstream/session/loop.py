@@ -60,8 +60,7 @@ class Session(Generic[State, Memory]):
 
     Raises:
         CalibrationError: the pictures of a camera are larger than a stream allows.
-        ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
-            is not possible.
+        ConfigError: the stream to resume was made with another configuration or from another capture.
     """
 
     def __init__(

@@ -33,7 +33,6 @@ from itertools import takewhile
 from typing import ClassVar
 
 from structgstream.codec.packets import PacketKind
-from structgstream.errors import ConfigError
 from structgstream.session.periods import KeyFrames
 from structgstream.training.online.config import OnlineConfig
 
@@ -73,8 +72,7 @@ class RateController:
 
     The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
     about the cube root of lambda, so each step corrects about a third of the excess. ``keys`` must receive each packet
-    before this object does. A warning is logged when the target starts to be missed. Raises ConfigError if the target
-    is not positive.
+    before this object does. A warning is logged when the target starts to be missed.
     """
 
     def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:
@@ -83,8 +81,6 @@ class RateController:
         self._budget: float | None = None  # bytes per frame of the media
         if config.target_mbits is None:
             return
-        if config.target_mbits <= 0:
-            raise ConfigError(f"A target of {config.target_mbits:g} Mbit/s; it must be positive.")
         window = max(2, round(config.WINDOW_SECONDS * fps), keys.interval)
         self._budget = config.target_mbits * 1e6 / 8.0 / fps
         self._fps, self._keys, self._window = fps, keys, window
