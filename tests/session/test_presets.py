@@ -78,6 +78,9 @@ def test_a_configuration_has_the_defaults_of_what_a_header_lacks() -> None:
         ({"seed": "0"}, "seed is '0'; expected a whole number"),
         ({"seed": True}, "seed is True; expected a whole number"),
         ({"online": 5}, "of another kind than its field"),
+        ({"codec": "zip"}, "of another kind than its field"),
+        ({"online": {"dynamic": "free"}}, "of another kind than its field"),
+        ({"online": {"dynamic": ["free", 1]}}, "of another kind than its field"),
         ({"online": {"iterations": None}}, "iterations is None; expected a whole number"),
     ],
 )
@@ -96,6 +99,7 @@ def test_what_no_field_can_have_is_refused_by_its_reason(edit: dict[str, Any], s
         ("initial.rates.offsets", (-1e-3, 0.0)),
         ("key_interval_seconds", math.inf),
         ("rate.target_mbits", -1.0),
+        ("rate.target_mbits", 0.0),
         ("seed", -1),
     ],
 )
