@@ -19,5 +19,3 @@ def test_who_asks_first_makes_it() -> None:
     once.clear()
     assert once.value(3, lambda: make("f")) == ("f", True)
     assert made == ["a", "c", "d", "e", "f"]
-
-
