@@ -2,12 +2,15 @@
 """``tests/support/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
 
 import importlib
+import io
 import sys
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,6 +58,21 @@ def moving_pictures(count: int = 12, *, width: int = 128, height: int = 96) -> l
         picture[20:44, left : left + 20] = (230, 40 + 10 * number, 30)
         pictures.append(picture)
     return pictures
+
+
+def coded_film(codec: str, numbers: Iterable[int], **options: str) -> bytes:
+    """Pictures of the film of :func:`moving_pictures`, over and over, at the times of their numbers, as MPEG-TS."""
+    written = io.BytesIO()
+    with av.open(written, "w", format="mpegts") as output:
+        stream = output.add_stream(codec, rate=30, options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        for number in numbers:
+            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return written.getvalue()
 
 
 @cache

@@ -5,7 +5,7 @@ import io
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
@@ -30,7 +30,7 @@ from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.opus import PACKET_SECONDS
 from tests.support.captures import write_picture
 from tests.support.rigs import arc_rig
-from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream
+from tests.support.sender_modules import coded_film, moving_pictures, sender, sent_loops, sent_stream
 from tests.support.sounds import add_sound, claps, packets_heard
 from tests.support.varied import varied
 
@@ -95,17 +95,6 @@ def shown(image: np.ndarray) -> int:
     errors = ((np.stack(moving_pictures()).astype(float) - image) ** 2).mean((1, 2, 3))
     assert errors.min() < 60
     return int(errors.argmin())
-
-
-class Recorded(recording.Recording):
-    """Where nothing is written."""
-
-    def __init__(self) -> None:
-        return None
-
-
-def decoded() -> av.VideoFrame:
-    return av.VideoFrame.from_ndarray(moving_pictures()[0], format="rgb24").reformat(format="yuv420p")
 
 
 @pytest.mark.parametrize("transport", ["udp", "tcp", "http"])
@@ -330,28 +319,6 @@ def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeyp
     assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
 
 
-def coded(codec: str, numbers: Iterable[int]) -> bytes:
-    """These pictures of the film as a transport stream, at their times."""
-    written = io.BytesIO()
-    with av.open(written, "w", format="mpegts") as output:
-        stream = output.add_stream(codec, rate=30, options={"g": "6", "bf": "0", "tune": "zerolatency"})
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
-        for number in numbers:
-            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
-            frame.pts = number
-            output.mux(stream.encode(frame))
-        output.mux(stream.encode(None))
-    return written.getvalue()
-
-
-def record(recorder: recording.CameraRecorder, stream: bytes) -> None:
-    with av.open(io.BytesIO(stream), "r") as container:
-        for packet in container.demux(video=0):
-            if packet.size:
-                recorder.record(packet, shift_seconds=0.0)
-
-
 def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tmp_path: Path) -> None:
     folder = tmp_path / "take"
     kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS, masks=tmp_path)
@@ -359,7 +326,11 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
     for first in range(0, 48, 12):
         for name in ("b", "a", "c"):
             codec = "mpeg2video" if name == "b" and first >= 24 else "libx264"
-            record(recorders[name], coded(codec, range(first, first + 12)))
+            film = coded_film(codec, range(first, first + 12), g="6", bf="0", tune="zerolatency")
+            with av.open(io.BytesIO(film), "r") as container:
+                for packet in container.demux(video=0):
+                    if packet.size:
+                        recorders[name].record(packet, shift_seconds=0.0)
     kept.close()
     assert not (folder / "part-002").exists(), "one change, one part"
     parts = [list(open_capture(part).frames()) for part in (folder, folder / "part-001")]
@@ -398,7 +369,7 @@ def test_a_recording_that_cannot_be_ended_does_not_end_the_others(caplog: pytest
         def close(self) -> None:
             raise OSError(28, "No space left on device")
 
-    recorder = recording.CameraRecorder(Recorded(), "b", FaultLog("rig", now=lambda: 0.0))
+    recorder = recording.CameraRecorder(None, "b", FaultLog("rig", now=lambda: 0.0))  # type: ignore[arg-type]
     recorder._output = Full()
     recorder.close()
     recorder.close()
@@ -416,7 +387,8 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
     monkeypatch.setattr(source_module, "srgb", converted)
     source = LiveSource(files(tmp_path), tmp_path / "x.sgs")
     source._sizes["b"] = 64, 48
-    pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
+    shot = av.VideoFrame.from_ndarray(moving_pictures()[0], format="rgb24").reformat(format="yuv420p")
+    pictures = {name: LivePicture(0.5, 0.0, shot) for name in NAMES}
     assert [*source._converted(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
     assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
     assert source.faults.counts["b"] == {"garbage": 1}
