@@ -19,18 +19,9 @@ FOLDER = Path(__file__).parent / "senders"
 
 def sender() -> ModuleType:
     """The module, which lies outside of any package."""
-    return _of_the_tool("send")
-
-
-def mpeg_ts() -> ModuleType:
-    """The module beside it that makes MPEG-TS."""
-    return _of_the_tool("mpeg_ts")
-
-
-def _of_the_tool(name: str) -> ModuleType:
     if str(FOLDER) not in sys.path:
         sys.path.append(str(FOLDER))
-    return importlib.import_module(name)
+    return importlib.import_module("send")
 
 
 class Collected:
@@ -87,5 +78,5 @@ def sent_stream(*troubles: str, frames: int = 60, fps: float = 30.0, begun: floa
     parsed = [module.Trouble.parsed(f"a:{trouble}") for trouble in troubles]
     camera = module.SentCamera("a", sent_loops(), line, fps, parsed)
     for number in range(frames):
-        camera.send(number, begun=begun, now=begun)
+        camera.send(number, begun=begun)
     return bytes(line.data)
