@@ -111,7 +111,8 @@ def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkey
 
 def test_every_frame_has_a_seed_of_its_own(quick_fits: list[int]) -> None:
     uninterrupted()
-    assert quick_fits == [frame_seed(0, i) for i in range(5)]
+    assert quick_fits == [frame_seed(0, i) for i in range(5)] == [0, 1, 2, 3, 4]
+    assert frame_seed(2, 7) == 2_000_013
 
 
 def test_resuming_gives_the_bytes_of_an_uninterrupted_run(quick_fits: list[int], tmp_path: Path) -> None:

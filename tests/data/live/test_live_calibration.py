@@ -30,12 +30,6 @@ def prepared(folder: Path) -> PreparedCapture:
     return capture
 
 
-def test_a_prepared_capture_needs_its_file_alone(tmp_path: Path) -> None:
-    capture = prepared(tmp_path)
-    read = read_calibration(tmp_path)
-    assert (read.fps, read.held_out, [*read.cameras]) == (25.0, capture.held_out, [*capture.cameras])
-
-
 def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
     capture, path = prepared(tmp_path), tmp_path / "rig.toml"
     filmed = filmed_rig(tmp_path, capture)

@@ -178,15 +178,18 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
 def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
     tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Frame 0 does not wait for it either."""
-    path = files(tmp_path)
+    """Frame 0 does not wait for it either, and a recording does not name it: that would be refused as a capture."""
+    path, folder = files(tmp_path), tmp_path / "take"
     (tmp_path / "a.ts").unlink()
     if content is not None:
         (tmp_path / "a.ts").write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions()).frames())
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     assert len(frames) >= 20
     assert all([*frame.images] == ["b", "c"] for frame in frames)
+    again = open_capture(folder)
+    assert [*again.rig] == ["b", "c"]
+    assert len(again) == 30
     (reported,) = [text for text in caplog.messages if "camera 'a'" in text]
     assert f"its file {tmp_path / 'a.ts'} cannot be read (" in reported
     assert "correct its url in the rig file, or give follow = true" in reported
@@ -338,16 +341,6 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
     for frame in (*parts[0], *parts[1]):
         assert {shown(image) for image in frame.images.values()} == {frame.index % 12}
         assert [*frame.images] == list(NAMES)
-
-
-def test_a_recording_names_the_cameras_that_sent_something(tmp_path: Path) -> None:
-    """Its capture would be refused otherwise, for a file that was never there."""
-    path, folder = files(tmp_path), tmp_path / "take"
-    (tmp_path / "a.ts").unlink()
-    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
-    again = open_capture(folder)
-    assert [*again.rig] == ["b", "c"]
-    assert len(again) == 30
 
 
 def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
