@@ -198,7 +198,17 @@ class Receiver(Protocol):
         ...
 
 
-OpenCamera = Callable[[LiveCamera, float], AbstractContextManager[Any]]
+def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
+    """The opened camera."""
+    options = {**PROBE_OPTIONS, **camera.options}
+    if camera.follow:
+        options["follow"] = "1"
+    if camera.is_session:
+        # Without this FFmpeg opens nothing but files from a file.
+        options.setdefault("protocol_whitelist", "file,udp,rtp")
+    # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
+    timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
+    return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
 
 
 class CameraFeed:
@@ -209,7 +219,7 @@ class CameraFeed:
         now: monotonic seconds; ``unix_offset`` added, Unix time.
         silent_seconds: without packets for this time, the camera is opened again.
         stuck_seconds: a picture that does not change for this time is not used if others change.
-        open_camera: opens a camera with a timeout in seconds; None for PyAV.
+        open_camera: opens a camera with a timeout in seconds.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
         sound: receives the camera's sound; None where that is not wanted.
     """
@@ -228,7 +238,7 @@ class CameraFeed:
         silent_seconds: float,
         stuck_seconds: float,
         recorder: CameraRecorder | None = None,
-        open_camera: OpenCamera | None = None,
+        open_camera: Callable[[LiveCamera, float], AbstractContextManager[Any]] = open_with_pyav,
         wait: Callable[[float], object] | None = None,
         sound: LiveSound | None = None,
     ) -> None:
@@ -236,8 +246,7 @@ class CameraFeed:
         self._receiver, self._clock, self._faults = receiver, clock, faults
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
-        self._recorder, self._sound = recorder, sound
-        self._open_camera = open_with_pyav if open_camera is None else open_camera
+        self._recorder, self._sound, self._open_camera = recorder, sound, open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
         # A daemon, so that a camera that hangs in the system cannot keep the program from ending.
@@ -510,19 +519,6 @@ class CameraFeed:
         if self._gone_since is not None:
             self._faults.warn(self.name, "back", f"is back after {arrived - self._gone_since:.1f} s")
             self._gone_since = None
-
-
-def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
-    """The opened camera."""
-    options = {**PROBE_OPTIONS, **camera.options}
-    if camera.follow:
-        options["follow"] = "1"
-    if camera.is_session:
-        # Without this FFmpeg opens nothing but files from a file.
-        options.setdefault("protocol_whitelist", "file,udp,rtp")
-    # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
-    timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
-    return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
 
 
 def _is_of(packet: "Packet", picture: "VideoFrame") -> bool:
