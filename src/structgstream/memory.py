@@ -84,4 +84,3 @@ def status_bytes(name: str) -> int | None:
     sizes = (line.split()[1] for line in lines if line.startswith(f"{name}:"))
     size = next(sizes, None)
     return None if size is None else int(size) * 1024
-

@@ -224,4 +224,3 @@ def _empty_scene(rig: CameraRig) -> Scene:
         camera_color=CameraColor.identity(len(rig.training)),
         distance_input=False,
     )
-

@@ -86,10 +86,10 @@ def read_value(kind: Any, value: Any, path: str = "") -> Any:
     """
     if isinstance(kind, type) and is_dataclass(kind):
         hints = get_type_hints(kind)
-        if unknown := [f"{path}{name}" for name in value.keys() - hints.keys()]:
+        if unknown := [name for name, _ in value.items() if name not in hints]:
             raise ConfigError(
-                f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
-                "have; continue the stream with the version that began it."
+                f"The header's configuration has the field {path}{unknown[0]}, which this version of structgstream "
+                "does not have; continue the stream with the version that began it."
             )
         return kind(**{name: read_value(hints[name], item, f"{path}{name}.") for name, item in value.items()})
     origin, arguments = get_origin(kind), get_args(kind)
