@@ -43,16 +43,13 @@ class Received:
         self.pictures: list[LivePicture] = []
         self.losses = 0
         self.waits: list[float] = []
-        self.others = -float("inf")
+        self.changed_at = {"another": -float("inf")}
 
-    def deliver(self, camera: str, picture: LivePicture) -> None:
+    def add(self, camera: str, picture: LivePicture) -> None:
         self.pictures.append(picture)
 
     def mark_absent(self, camera: str) -> None:
         self.losses += 1
-
-    def others_changed_at(self, camera: str) -> float:
-        return self.others
 
     @property
     def numbers(self) -> list[int]:
@@ -80,7 +77,8 @@ def camera_feed(
         "a",
         camera,
         size=(128, 96),
-        receiver=received,
+        synchronizer=received,  # type: ignore[arg-type]
+        changed_at=received.changed_at,
         clock=clock(base),
         faults=faults,
         now=lambda: next(ticks) * PERIOD / 2,
@@ -167,7 +165,7 @@ class Packets:
         seconds = {packet.pts: float(packet.pts * packet.time_base) + shift for packet, shift in self.found}
         for packet in (*(packet for packet, _ in self.found), None):
             for frame in decoder.decode(packet):  # type: ignore[attr-defined]
-                received.deliver("a", LivePicture(seconds[frame.pts], 0.0, frame))
+                received.add("a", LivePicture(seconds[frame.pts], 0.0, frame))
         return received
 
 
@@ -224,7 +222,7 @@ def test_a_picture_of_other_proportions_is_left_out_and_a_reduced_one_is_taken(
 @pytest.mark.parametrize("still", [True, False])
 def test_a_picture_that_stands_still_is_left_out_if_others_change(still: bool) -> None:
     received = Received()
-    received.others = -float("inf") if still else 1e9
+    received.changed_at["another"] = -float("inf") if still else 1e9
     received, faults = read(sent_stream("stuck:0.4:1.2"), received=received)
     if still:
         assert "stuck" not in faults

@@ -32,7 +32,7 @@ class Bench:
 
     def send(self, seconds: float, *names: str) -> None:
         for name in names:
-            self.ingest.deliver(name, LivePicture(seconds, seconds, np.zeros(1)))
+            self.ingest._synchronizer.add(name, LivePicture(seconds, seconds, np.zeros(1)))
 
     def running(self) -> "Bench":
         """With the thread that makes sets, without those of cameras."""
@@ -78,7 +78,7 @@ def test_who_sends_is_present_until_the_deadline() -> None:
     assert bench.ingest.describe_absent() == "2 of 3 cameras send; absent: c"
     bench.send(101.1, "c")
     assert bench.ingest.describe_absent() == "3 of 3 cameras send; absent: none"
-    bench.ingest.mark_absent("a")
+    bench.ingest._synchronizer.mark_absent("a")
     assert "absent: a" in bench.ingest.describe_absent()
     bench.now = 101.55
     assert bench.ingest.present == ["c"]
@@ -130,13 +130,6 @@ def test_files_that_end_end_the_stream_when_everything_was_taken() -> None:
     assert bench.ingest.end_reason is None
 
 
-def test_others_that_change_are_those_of_other_cameras() -> None:
-    bench = Bench("a", "b")
-    bench.ingest.feeds["a"].changed_at = 7.0
-    assert bench.ingest.others_changed_at("b") == 7.0
-    assert Bench("a").ingest.others_changed_at("a") == -float("inf")
-
-
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [
@@ -152,3 +145,8 @@ def test_a_camera_out_of_step_is_reported_with_its_remedy(
     (record,) = caplog.records
     assert "b" in record.getMessage()
     assert re.search(said, record.getMessage())
+
+
+def test_each_camera_knows_when_the_others_changed() -> None:
+    first, second = Bench("a", "b").ingest.feeds.values()
+    assert first._changed_at is second._changed_at

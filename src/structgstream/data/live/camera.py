@@ -23,7 +23,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from structgstream.data.live.recorder import CameraRecorder
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
-from structgstream.data.live.synchronizer import LivePicture
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
 from structgstream.data.video_index import load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
@@ -182,22 +182,6 @@ ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
-class Receiver(Protocol):
-    """Receives a camera's pictures; called from the camera's thread."""
-
-    def deliver(self, camera: str, picture: LivePicture) -> None:
-        """A picture."""
-        ...
-
-    def mark_absent(self, camera: str) -> None:
-        """The camera is disconnected, or sends nothing usable."""
-        ...
-
-    def others_changed_at(self, camera: str) -> float:
-        """When the picture of another camera last changed, monotonic seconds."""
-        ...
-
-
 def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
     """The opened camera."""
     options = {**PROBE_OPTIONS, **camera.options}
@@ -216,6 +200,7 @@ class CameraFeed:
 
     Args:
         size: width and height of the calibration's pictures.
+        changed_at: by camera, when its picture last changed, monotonic seconds; shared by all feeds.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
         silent_seconds: without packets for this time, the camera is opened again.
         stuck_seconds: a picture that does not change for this time is not used if others change.
@@ -230,7 +215,8 @@ class CameraFeed:
         camera: LiveCamera,
         *,
         size: tuple[int, int],
-        receiver: Receiver,
+        synchronizer: FrameSynchronizer,
+        changed_at: dict[str, float],
         clock: ClockMapper,
         faults: FaultLog,
         now: Callable[[], float],
@@ -243,7 +229,8 @@ class CameraFeed:
         sound: LiveSound | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
-        self._receiver, self._clock, self._faults = receiver, clock, faults
+        self._synchronizer, self._changed_at = synchronizer, changed_at
+        self._clock, self._faults = clock, faults
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
         self._recorder, self._sound, self._open_camera = recorder, sound, open_camera
@@ -263,7 +250,6 @@ class CameraFeed:
         self._usable = True
         self.ended = False
         self.decoded = 0
-        self.changed_at = -float("inf")
 
     def start(self) -> None:
         """Begins to read."""
@@ -413,7 +399,7 @@ class CameraFeed:
         self._forget(picture)
         if not self._decodes:
             return
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         text = f"sends what cannot be decoded ({reason}); it is absent until its next key frame"
         self._faults.report(self.name, Fault.GARBAGE, text)
 
@@ -426,7 +412,7 @@ class CameraFeed:
         seconds = self._common_time(frame, arrived, wrap_seconds)
         self._usable = self._has_calibrated_shape(frame)
         if seconds is not None and self._usable and not self._is_frozen(frame, arrived):
-            self._receiver.deliver(self.name, LivePicture(seconds, arrived, frame))
+            self._synchronizer.add(self.name, LivePicture(seconds, arrived, frame))
         return self._clock.shift
 
     def _pace(self, frame: "VideoFrame") -> None:
@@ -478,25 +464,27 @@ class CameraFeed:
         text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
         self._faults.report(self.name, Fault.OTHER_SIZE, text)
         if not alike:
-            self._receiver.mark_absent(self.name)
+            self._synchronizer.mark_absent(self.name)
         return alike
 
     def _is_frozen(self, frame: "VideoFrame", arrived: float) -> bool:
         """Whether the picture has not changed for a long time while those of other cameras did."""
         checksum = picture_checksum(frame)
         if checksum != self._checksum:
-            self._checksum, self.changed_at = checksum, arrived
+            self._checksum, self._changed_at[self.name] = checksum, arrived
             return False
-        if self._receiver.others_changed_at(self.name) - self.changed_at < self._stuck:
+        changed_at = self._changed_at[self.name]
+        others = (seconds for name, seconds in self._changed_at.items() if name != self.name)
+        if max(others, default=changed_at) - changed_at < self._stuck:
             return False
-        text = f"has sent the same picture for {arrived - self.changed_at:.1f} s; it is absent until that changes"
+        text = f"has sent the same picture for {arrived - changed_at:.1f} s; it is absent until that changes"
         self._faults.report(self.name, Fault.STUCK, text)
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         return True
 
     def _report_end(self, reason: str) -> None:
         """A file was read to its end, or cannot be read."""
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         if self.decoded:
             how = "" if reason is ENDED else f" ({reason})"
             text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"
@@ -511,7 +499,7 @@ class CameraFeed:
     def _report_gone(self, reason: str) -> None:
         if self._gone_since is None:
             self._gone_since = self._now()
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         text = f"at {self._camera.shown_url} is gone ({reason}); it is absent, and is opened again until it is back"
         self._faults.report(self.name, Fault.GONE, text)
 

@@ -9,7 +9,7 @@ from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
-from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
+from structgstream.data.live.synchronizer import FrameSynchronizer, PictureSet
 
 TICK_SECONDS = 0.02
 MAX_MISSED_SETS = 30  # before a camera is reported as out of step
@@ -49,21 +49,20 @@ class Ingest:
             count=faults.count,
             started=now(),
         )
-        self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._last_arrival = now()
         self._failure: BaseException | None = None
         self._newest: PictureSet | None = None
         self._complete = threading.Condition()
         self.sets = 0
         self.skipped_sets = 0  # replaced by a newer one before they were taken
-        resets = ClockResets()
+        resets, changed_at = ClockResets(), dict.fromkeys(rig.cameras, -float("inf"))
         self.feeds = {
             name: CameraFeed(
                 name,
                 camera,
                 size=sizes[name],
-                receiver=self,
+                synchronizer=self._synchronizer,
+                changed_at=changed_at,
                 clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
                 faults=faults,
                 now=now,
@@ -99,34 +98,15 @@ class Ingest:
             pictures, self._newest = self._newest, None
         return pictures
 
-    def deliver(self, camera: str, picture: LivePicture) -> None:
-        """See ``camera.Receiver``."""
-        with self._changed:
-            self._synchronizer.add(camera, picture)
-            self._last_arrival = picture.arrived
-            self._changed.notify()
-
-    def mark_absent(self, camera: str) -> None:
-        """See ``camera.Receiver``."""
-        with self._changed:
-            self._synchronizer.mark_absent(camera)
-            self._changed.notify()
-
-    def others_changed_at(self, camera: str) -> float:
-        """See ``camera.Receiver``."""
-        return max((feed.changed_at for name, feed in self.feeds.items() if name != camera), default=-float("inf"))
-
     @property
     def queue_lengths(self) -> dict[str, int]:
         """Number of pictures that wait to be matched, by camera."""
-        with self._changed:
-            return self._synchronizer.queue_lengths
+        return self._synchronizer.queue_lengths
 
     @property
     def present(self) -> list[str]:
         """Cameras that send usable pictures, the next of which is not later than the deadline."""
-        with self._changed:
-            return self._synchronizer.present(self._now())
+        return self._synchronizer.present(self._now())
 
     @property
     def open_cameras(self) -> list[str]:
@@ -146,7 +126,7 @@ class Ingest:
             return None
         if not self.open_cameras and not any(self.queue_lengths.values()):
             return "all files of cameras have come to their end, or cannot be read"
-        limit, silent = self._rig.end_seconds, self._now() - self._last_arrival
+        limit, silent = self._rig.end_seconds, self._now() - self._synchronizer.last_arrived
         if limit is not None and silent > limit:
             return f"no camera has sent a picture for {silent:.0f} s, so the stream ends (end_seconds in the rig file)"
         return None
@@ -160,10 +140,10 @@ class Ingest:
     def _synchronize(self) -> None:
         try:
             while not self._stop.is_set():
-                with self._changed:
+                with self._synchronizer.changed:
                     pictures = self._synchronizer.next_set(self._now())
                     if pictures is None:
-                        self._changed.wait(TICK_SECONDS)
+                        self._synchronizer.changed.wait(TICK_SECONDS)
                         continue
                     out_of_step = self._synchronizer.out_of_step(MAX_MISSED_SETS)
                 with self._complete:
