@@ -78,7 +78,6 @@ def test_each_stage_has_its_own_peak() -> None:
 def test_where_the_mark_cannot_be_set_back_it_only_rises(
     missing: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    pytest.importorskip("resource")
     monkeypatch.setattr(memory, missing, tmp_path / "no folder" / "nothing")
     meter = PeakMeter(CPU)
     spend(meter, "large", MEGABYTES_64)

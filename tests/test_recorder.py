@@ -12,15 +12,15 @@ import pytest
 from structgstream.cli.app import Terminated
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.errors import StorageError
-from structgstream.evaluation.run_log import append_log, log_path, read_log
-from structgstream.recorder import RunMetrics, check_output, free_bytes, log_reports, metrics_path
+from structgstream.evaluation.run_log import log_path, read_log
+from structgstream.recorder import RunMetrics, check_output, free_bytes, logged, metrics_path
 from structgstream.session.frame_report import FrameReport
 from tests.support.reports import frame_report
 
 
-def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]:
+def run(closed: list[str]) -> Generator[FrameReport, None, None]:
     try:
-        for index in range(start, 3):
+        for index in range(3):
             yield frame_report(index)
     finally:
         closed.append("session")
@@ -28,24 +28,16 @@ def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]
 
 def test_a_line_is_there_when_its_frame_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "x.sgs"
-    reports = log_reports(run([]), path, done=0, remarks=lambda one: {"first": True} if one.index == 0 else {})
+    reports = logged(run([]), path, remarks=lambda one: {"first": True} if one.index == 0 else {})
     for count, one in enumerate(reports, start=1):
         assert [*read_log(path)] == [*range(count)]
         assert one.index == count - 1
     assert ["first" in entry for entry in read_log(path).values()] == [True, False, False]
 
 
-def test_a_resumed_log_keeps_what_is_stored_and_drops_the_rest(tmp_path: Path) -> None:
-    path = tmp_path / "x.sgs"
-    for index in range(3):
-        append_log(path, {"index": index, "run": 1})
-    assert [one.index for one in log_reports(run([], start=2), path, done=2)] == [2]
-    assert [entry.get("run") for entry in read_log(path).values()] == [1, 1, None]
-
-
 def test_closing_it_closes_the_session(tmp_path: Path) -> None:
     closed: list[str] = []
-    reports = log_reports(run(closed), tmp_path / "x.sgs", done=0)
+    reports = logged(run(closed), tmp_path / "x.sgs")
     next(reports)
     assert not closed
     reports.close()
@@ -54,7 +46,7 @@ def test_closing_it_closes_the_session(tmp_path: Path) -> None:
 
 def test_a_log_that_cannot_be_written_ends_the_session(tmp_path: Path) -> None:
     closed: list[str] = []
-    reports = log_reports(run(closed), tmp_path / "x.sgs", done=0)
+    reports = logged(run(closed), tmp_path / "x.sgs")
     next(reports)
     log_path(tmp_path / "x.sgs").unlink()
     log_path(tmp_path / "x.sgs").mkdir()

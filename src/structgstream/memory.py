@@ -50,7 +50,9 @@ class PeakMeter:
     def end(self, stage: str) -> None:
         """Records the peak of the stage that ends here and starts the next."""
         peak = status_bytes("VmHWM") if self.kind is PeakKind.STAGE else None
-        self.process_bytes[stage] = process_peak_bytes() if peak is None else peak
+        if peak is None:
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        self.process_bytes[stage] = peak
         if self._device is not None:
             self.device_bytes[stage] = torch.cuda.max_memory_allocated(self._device)
         restarted = self._restart()
@@ -82,8 +84,3 @@ def status_bytes(name: str) -> int | None:
     sizes = (line.split()[1] for line in lines if line.startswith(f"{name}:"))
     size = next(sizes, None)
     return None if size is None else int(size) * 1024
-
-
-def process_peak_bytes() -> int:
-    """Largest resident size of the process since the last reset."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -18,9 +18,8 @@ those of separate runs. Qualities fit a frame one after the other, so only the l
 
 import math
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -44,7 +43,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Run, RunMetrics, Storage, log_reports, with_sound
+from structgstream.recorder import Run, RunMetrics, Storage, logged, with_sound
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
@@ -180,38 +179,27 @@ PICTURES_KEPT = 3
 
 
 class Once(Generic[Value]):
-    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe."""
+    """The last ``most`` values, each computed at its first request, one at a time. Thread-safe."""
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._found: OrderedDict[Hashable, Future[Value]] = OrderedDict()
+        self._found: dict[Hashable, Value] = {}
         self._lock = threading.Lock()
 
     def value(self, key: Hashable, make: Callable[[], Value]) -> tuple[Value, bool]:
-        """The value of ``key``, and whether it was computed now. All waiting requests receive an error of ``make``."""
+        """The value of ``key``, and whether it was computed now."""
         with self._lock:
-            found = self._found.get(key)
-            mine = found is None
-            if found is None:
-                found = self._found[key] = Future()
-                while len(self._found) > self._most:
-                    self._found.popitem(last=False)
-        if mine:
-            try:
-                found.set_result(make())
-            except BaseException as error:
-                found.set_exception(error)
-                self._forget(key)
-        return found.result(), mine
+            if key in self._found:
+                return self._found[key], False
+            while len(self._found) >= self._most:
+                del self._found[next(iter(self._found))]
+            value = self._found[key] = make()
+            return value, True
 
     def clear(self) -> None:
         """Removes all values."""
         with self._lock:
             self._found.clear()
-
-    def _forget(self, key: Hashable) -> None:
-        with self._lock:
-            self._found.pop(key, None)
 
 
 @dataclass(frozen=True)
@@ -352,13 +340,13 @@ def record_qualities(
         # Frames are denoised below, once for all qualities.
         pipeline = replace(stream_pipeline(own), method=SharedMethod(own, shared=work), denoising=DenoisingConfig())
         opened.append(_Opened(quality.name, pipeline, sink, stored))
-    starts, firsts = [one.start for one in opened], [one.first for one in opened]
     shown = read_ahead(denoised(source, config.denoising))
-    frames = SharedFrames(shown, starts=starts, first=firsts)
+    frames = SharedFrames(shown, starts=[one.start for one in opened], first=[one.first for one in opened])
     reports = {}
     for one, reader in zip(opened, frames.readers, strict=True):
         session = Session(reader, one.sink, one.pipeline, backend, resumed=one.stored, metadata=stated, on_step=on_step)
-        reports[one.name] = log_reports(session.run(), folder / one.name, done=one.done)
+        begin_log(folder / one.name, frames=one.done)
+        reports[one.name] = logged(session.run(), folder / one.name)
     done = {one.name: one.done for one in opened}
     rates, least = BitRates(folder, qualities), min(done.values())
     rates.begin(resume=resume)

@@ -14,9 +14,8 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
-from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,21 +98,15 @@ def record(
         sink, metadata = with_sound(sink, metadata, sound, source=source, resumed=resumed)
     session = Session(read_ahead(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
-    return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
-
-
-def log_reports(
-    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
-) -> Generator[FrameReport, None, None]:
-    """The reports of a session, each written to the log next to ``path`` before it is yielded; lines of the ``done``
-    existing frames are retained. Raises StorageError if the log cannot be written."""
     begin_log(path, frames=done)
-    return _append_reports(reports, path, remarks)
+    return Run(done, logged(session.run(), path, remarks))
 
 
-def _append_reports(
-    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None
+def logged(
+    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
+    """The reports of a session, each appended to the log next to ``path``, which was begun, before it is yielded.
+    Raises StorageError if the log cannot be written."""
     with closing(reports):
         for report in reports:
             further = {} if remarks is None else remarks(report)
@@ -315,19 +308,13 @@ def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:
     return to_8bit_image(render(SceneDecoder(header).decode(packet), view, processor_backend()).image)
 
 
-METRICS_FORMAT, METRICS_VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
-RATES = ("frames_in_per_second", "frames_out_per_second", "bits_per_second")
 RECENT = 30  # number of frames over which rates are measured
-
-
-class RunState(StrEnum):
-    """State of a run."""
-
-    WAITING = "waiting"  # for the first frame
-    RUNNING = "running"
-    FINISHED = "finished"
-    FAILED = "failed"
+LOGGED = (
+    "frames_in_per_second", "frames_out_per_second", "bits_per_second", "stored_after_seconds", "disk_free_bytes",
+    "resident_bytes", "live",
+)  # fmt: skip
+"""Keys of the metrics that a frame's line in the log has, too."""
 
 
 def metrics_path(stream: Path) -> Path:
@@ -387,7 +374,7 @@ class RunMetrics:
         self._live, self._captured, self._now, self._unix = live, captured, now, unix
         self._age: float | None = None
         self._begun = now()
-        self._state = RunState.WAITING
+        self._state: Literal["waiting", "running", "finished", "failed"] = "waiting"  # for the first frame
         self._figures = Figures(fps)
         self._absent: list[str] | None = None
         self._qualities = {name: Figures(fps) for name in qualities}
@@ -403,7 +390,7 @@ class RunMetrics:
     def frame(self, report: FrameReport) -> dict[str, Any]:
         """Add a frame's report of all qualities; returns further entries of its line in the log if the run is live."""
         with self._lock:
-            self._state = RunState.RUNNING
+            self._state = "running"
             self._figures.add(report)
             self._stored.append((self._now(), report.index))
             self._absent = list(report.absent)
@@ -414,8 +401,7 @@ class RunMetrics:
         if self._live is None:
             return {}
         taken = self.values()
-        keys = (*RATES, "stored_after_seconds", "disk_free_bytes", "resident_bytes", "live")
-        return {"run": {key: taken[key] for key in keys}}
+        return {"run": {key: taken[key] for key in LOGGED}}
 
     def values(self) -> dict[str, Any]:
         """All metrics, as plain JSON values."""
@@ -430,10 +416,10 @@ class RunMetrics:
                 each = {name: {"frames": own.frames, **own.values()} for name, own in self._qualities.items()}
                 several["qualities"] = each
             return {
-                "format": METRICS_FORMAT,
-                "version": METRICS_VERSION,
+                "format": "structgstream-metrics",
+                "version": 1,
                 "stream": self._stream.name,
-                "state": self._state.value,
+                "state": self._state,
                 "process": os.getpid(),
                 "updated_unix_seconds": self._unix(),
                 "running_seconds": now - self._begun,
@@ -469,12 +455,12 @@ class RunMetrics:
 
         thread = threading.Thread(target=beat, name="metrics", daemon=True)
         thread.start()
-        ended = RunState.FAILED
+        ended: Literal["finished", "failed"] = "failed"
         try:
             yield
-            ended = RunState.FINISHED
+            ended = "finished"
         except KeyboardInterrupt:
-            ended = RunState.FINISHED
+            ended = "finished"
             raise
         finally:
             stop.set()

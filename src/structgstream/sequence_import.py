@@ -117,21 +117,23 @@ def import_sequence(
     linked = len({header.count for header in headers}) == 1 and (
         len(files) == 1 or same_rows(first.means, in_scene(read_ply(files[1])).means)
     )
-    position_step = _position_step(sampling.intervals(first.means))
+    interval = float(sampling.intervals(first.means).median().clamp(min=1e-9))
+    position_step = float32(POSITION_PIXELS * interval)
     reach = 0.999 * LARGEST * position_step
     chosen = _chosen(first, max_splats, reach)
+    empty = _empty_scene(rig)
     header = StreamHeader(
         rig=rig,
         similarity=similarity,
         fps=fps,
         codec="compact",
         dynamic=DYNAMIC,
-        static={name: value for name, value in state_of(_empty_scene(rig)).items() if name not in DYNAMIC},
+        static={name: value for name, value in state_of(empty).items() if name not in DYNAMIC},
         distance_input=False,
         config={"key_interval_seconds": KEY_INTERVAL_SECONDS},
         metadata={"capture": files[0].parent.name, "imported": "ply"},
         steps={"free_means": position_step, **STEPS},
-        init_steps={name: 1.0 for name in state_of(_empty_scene(rig)) if name not in UNCODED_FIELDS},
+        init_steps={name: 1.0 for name in state_of(empty) if name not in UNCODED_FIELDS},
     )
     encoder, key_interval = SceneEncoder(header), max(1, round(fps * KEY_INTERVAL_SECONDS)) if linked else 1
     psnr = color_psnr = math.inf
@@ -149,7 +151,7 @@ def import_sequence(
                 quats = gaussians.quats * same_side
                 gaussians = replace(gaussians, quats=quats)
             births = torch.arange(len(gaussians)) + (0 if linked else index << _FRAME_BITS)
-            scene = replace(_empty_scene(rig), free=_free(gaussians, cameras, births, reach), sampling=sampling)
+            scene = replace(empty, free=_free(gaussians, cameras, births, reach), sampling=sampling)
             kind = PacketKind.DELTA if index % key_interval else PacketKind.KEY
             encoded = encoder.encode(scene, index=index, pts_seconds=index / fps, kind=kind)
             sink.write(encoded.packet)
@@ -222,7 +224,3 @@ def _empty_scene(rig: CameraRig) -> Scene:
         camera_color=CameraColor.identity(len(rig.training)),
         distance_input=False,
     )
-
-
-def _position_step(intervals: Tensor) -> float:
-    return float32(POSITION_PIXELS * float(intervals.median().clamp(min=1e-9)))

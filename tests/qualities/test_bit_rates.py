@@ -21,10 +21,6 @@ def frames(rates: BitRates, first: int, end: int, **sizes: int) -> None:
         rates.refresh()
 
 
-def test_what_is_expected_rises_with_the_quality() -> None:
-    assert expected_bits(LOW) < expected_bits(Quality("mid", 0.0)) < expected_bits(HIGH)
-
-
 def test_a_rate_is_of_media_time_without_the_first_packet() -> None:
     assert bits_per_second([(0.0, 9999), (0.5, 100), (2.0, 100)]) == 800
     assert bits_per_second([(0.0, 9999)]) is None

@@ -19,7 +19,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import read_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
-from structgstream.data.live.resume_cache import ResumeCache, resume_folder
+from structgstream.data.live.resume_cache import resume_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
@@ -30,7 +30,7 @@ from structgstream.session.loop import Session
 from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
-from tests.support.moving_block import PERIODS, RIG, filmed
+from tests.support.moving_block import PERIODS, POINTS, RIG, LiveBlock, filmed
 from tests.support.small_presets import QUICK
 
 QUALITIES = qualities_in(["high=2", "low=-2"])
@@ -46,7 +46,7 @@ class Recorded:
     rig: CameraRig = RIG
     fps: float = 30.0
     name: str = "now"
-    points: np.ndarray = field(default_factory=lambda: np.random.default_rng(0).normal(size=(40, 3)) * 0.3)
+    points: np.ndarray = field(default_factory=POINTS.copy)
     read: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -58,36 +58,9 @@ class Recorded:
             yield MultiViewFrame(index, index / 4, filmed(index))
 
 
-class Live:
-    """Cameras that film each picture once; what a resumed run needs is kept beside the stream."""
-
-    rig, fps, name = RIG, 30.0, "now"
-
-    def __init__(self, folder: Path, *, resume: bool = False) -> None:
-        self._resume = resume
-        self.points = Recorded().points
-        self._cache = ResumeCache(resume_folder(folder), cameras=self.rig.training, resume=resume)
-        self.filmed: list[int] = []
-
-    def retain(self, *first: int, last: int) -> None:
-        self._cache.retain(*first, last=last)
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        index = start
-        for frame in self._cache.frames(start) if self._resume else ():
-            yield frame
-            index = frame.index + 1
-        while index < FRAMES:
-            self.filmed.append(index)
-            frame = MultiViewFrame(index, index / 4, filmed(index))
-            self._cache.store(frame, origin_seconds=0.0)
-            yield frame
-            index += 1
-
-
 def begun(
     folder: Path,
-    source: Recorded | Live,
+    source: Recorded | LiveBlock,
     config: StreamConfig = QUICK,
     *,
     resume: bool = False,
@@ -146,7 +119,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def test_a_period_that_begins_from_points_is_fitted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    points = torch.from_numpy(Recorded().points)
+    points = torch.from_numpy(POINTS)
     monkeypatch.setattr(loop, "initial_points_of", lambda *args, **further: points)
     config = replace(PERIODS, period=replace(PERIODS.period, start="points"))
     found = alone(tmp_path / "high.sgs", "high", config)
@@ -226,16 +199,16 @@ def test_a_run_that_was_killed_between_two_qualities_goes_on_to_the_same_bytes(
     whole: Path, tmp_path: Path, after: tuple[str, int], live: bool
 ) -> None:
     folder = tmp_path / "out"
-    left_by_a_kill(begun(folder, Live(folder) if live else Recorded()), folder, after=after)
-    source = Live(folder, resume=True) if live else Recorded()
+    left_by_a_kill(begun(folder, LiveBlock(folder, FRAMES) if live else Recorded()), folder, after=after)
+    source = LiveBlock(folder, FRAMES, resume=True) if live else Recorded()
     run = begun(folder, source, resume=True)
     quality, last = after
     lacking = quality == "low"
     assert run.done == last + 1 - lacking
     reports = [(one.quality, one.report.index) for one in run.reports]
     assert reports == [("high", last)] * lacking + [(n, i) for i in range(last + 1, FRAMES) for n in NAMES]
-    if isinstance(source, Live):
-        assert source.filmed == [*range(last + 1, FRAMES)], "what was filmed before is kept"
+    if isinstance(source, LiveBlock):
+        assert [*source.filmed] == [*range(last + 1, FRAMES)], "what was filmed before is kept"
     for name in NAMES:
         assert archived(folder, name) == archived(whole, name)
         assert read_manifest(FolderStore(folder / name)).edge.frame == FRAMES - 1
@@ -257,8 +230,8 @@ def test_periods_of_a_live_run_that_was_killed(
 ) -> None:
     """At the frame that begins another one in one quality and not yet in the other."""
     folder = tmp_path / "out"
-    left_by_a_kill(begun(folder, Live(folder), PERIODS), folder, after=after)
-    list(begun(folder, Live(folder, resume=True), PERIODS, resume=True).reports)
+    left_by_a_kill(begun(folder, LiveBlock(folder, FRAMES), PERIODS), folder, after=after)
+    list(begun(folder, LiveBlock(folder, FRAMES, resume=True), PERIODS, resume=True).reports)
     for name in NAMES:
         with open_stream(folder / name) as reader:
             assert [period.first_frame for period in reader.periods] == [0, 3]

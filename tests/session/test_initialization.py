@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a frame starts that has nothing before it: its seed and its points."""
+"""The points from which a frame starts that has nothing before it."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import torch
 from structgstream.cameras import Similarity
 from structgstream.data.points import PointsConfig
 from structgstream.session import loop
-from structgstream.session.loop import frame_seed, initial_points_of
+from structgstream.session.loop import initial_points_of
 from tests.support.memory_captures import MemoryCapture
 from tests.support.worlds import moving_world
 
@@ -18,12 +18,6 @@ SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)
 
 def source(points: np.ndarray | None = None) -> MemoryCapture:
     return MemoryCapture(WORLD.rig, WORLD.frames, fps=25.0, points=points)
-
-
-def test_seeds_of_frames_and_of_streams_are_apart() -> None:
-    assert frame_seed(0, 7) == 7
-    assert frame_seed(2, 7) == 2_000_013
-    assert frame_seed(-1, 0) == 2**63 - 1_000_003, "never negative"
 
 
 def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
+from structgstream.session import periods
 from structgstream.session.periods import KeyFrames, PeriodConfig, PeriodPlan
 
 FPS, KEY_EVERY = 25.0, 5
@@ -15,16 +16,15 @@ def begun(
     residuals: list[float],
     *,
     start: int = 0,
-    most: int = 100,
     times: list[float] | None = None,
 ) -> list[int]:
     """The frames that begin periods; a run that is resumed at ``start`` measures again what its plan asks for."""
-    plan, keys, found = PeriodPlan(config, most=most), KeyFrames(KEY_EVERY, FPS), [0]
+    plan, keys, found = PeriodPlan(config), KeyFrames(KEY_EVERY, FPS), [0]
     plan.begin(0, 0.0)
     seconds = [index / FPS for index in range(len(residuals))] if times is None else times
     for index, residual in enumerate(residuals):
         if index == start > 0:
-            plan = PeriodPlan(config, most=most)
+            plan = PeriodPlan(config)
             plan.begin(found[-1], seconds[found[-1]], number=len(found) - 1)
             for again in plan.needed(seconds[:index], keys):
                 plan.add(again, residuals[again])
@@ -90,7 +90,7 @@ def test_a_resumed_run_decides_the_same(config: PeriodConfig) -> None:
 
 
 def test_only_what_is_needed_is_measured() -> None:
-    plan, keys = PeriodPlan(PeriodConfig(residual=1.5, frames=2), most=9), KeyFrames(KEY_EVERY, FPS)
+    plan, keys = PeriodPlan(PeriodConfig(residual=1.5, frames=2)), KeyFrames(KEY_EVERY, FPS)
     plan.begin(0, 0.0)
     found = []
     for index in range(11):
@@ -101,8 +101,9 @@ def test_only_what_is_needed_is_measured() -> None:
     assert found == [0, 3, 4, 8, 9]
 
 
-def test_the_last_period_goes_on() -> None:
-    assert begun(PeriodConfig(seconds=5 / FPS), [1.0] * 40, most=3) == [0, 5, 10]
+def test_the_last_period_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(periods, "MAX_PERIODS", 3)
+    assert begun(PeriodConfig(seconds=5 / FPS), [1.0] * 40) == [0, 5, 10]
 
 
 @pytest.mark.parametrize(
@@ -116,4 +117,4 @@ def test_the_last_period_goes_on() -> None:
 )
 def test_values_that_mean_nothing_are_refused(config: PeriodConfig, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        PeriodPlan(config, most=9)
+        PeriodPlan(config)

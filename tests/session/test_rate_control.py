@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from structgstream.codec.packets import PacketKind
-from structgstream.errors import ConfigError
 from structgstream.session.periods import MIN_FRAMES, KeyFrames
 from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
@@ -85,7 +84,7 @@ def test_the_rate_is_met_at_few_frames_a_second(fps: float) -> None:
     """With a target there are delta packets, which alone can be pressed; without one all packets are key packets."""
     config = StreamConfig(rate=RateConfig(1.0))
     assert replace(config, rate=RateConfig()).key_interval(fps) == max(1, round(fps))
-    keys = KeyFrames(config.key_interval(fps), fps)
+    keys, sizes = KeyFrames(config.key_interval(fps), fps), []
     controller = RateController(config.rate, fps, keys=keys)
     for index in range(60):
         kind = keys.kind(index, index / fps)
@@ -93,7 +92,8 @@ def test_the_rate_is_met_at_few_frames_a_second(fps: float) -> None:
             keys.begin(index, index / fps)
         size = 200e3 / fps * (0.2 if kind is PacketKind.KEY else controller.pressure ** (-1 / 3))
         controller.add(int(size), kind, index=index, pts_seconds=index / fps)
-    assert controller.rate_mbits == pytest.approx(1.0, rel=0.02)
+        sizes.append(int(size))
+    assert sum(sizes[-20:]) * 8e-6 * fps / 20 == pytest.approx(1.0, rel=0.02)
 
 
 def test_a_key_packet_is_saved_for_before_it_comes() -> None:
@@ -117,8 +117,7 @@ def test_the_pressure_follows_from_the_packets_alone() -> None:
 def test_without_a_target_nothing_is_pressed() -> None:
     run = Run(None)
     run.add(10**9)
-    controller = run.controller
-    assert (controller.pressure, controller.rate_mbits, controller.missed) == (1.0, None, False)
+    assert run.controller.pressure == 1.0
     config = OnlineConfig()
     assert with_rate_control(config, 1.0) is config
 
@@ -138,12 +137,9 @@ def test_pressure_has_bounds_and_changes_step_by_step() -> None:
 
 def test_a_target_that_is_missed_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     run = Run(1.0)
-    controller = run.controller
     with caplog.at_level(logging.WARNING):
-        for index in range(100):
+        for _ in range(100):
             run.add(8000)
-            assert controller.missed == (index >= KEY_EVERY - 1), "there is a whole window"
-    assert controller.rate_mbits == pytest.approx(1.92)
     assert [record.getMessage() for record in caplog.records] == [
         "Frame 29: the last 30 frames take 1.92 Mbit/s, the target is 1; nothing more can be saved: take coarser steps "
         "(online.rounding.quality), spawn fewer Gaussians (online.spawn.most) or take a higher target."
@@ -167,12 +163,6 @@ def test_what_is_pressed() -> None:
     assert after.spawn.rules.missing_threshold == 2.0 * before.spawn.rules.missing_threshold
     assert after.spawn.thin_rules.missing_threshold == 2.0 * before.spawn.thin_rules.missing_threshold
     assert with_rate_control(before, 0.25).spawn == before.spawn, "more bits do not spawn noise"
-
-
-@pytest.mark.parametrize("target_mbits", [0.0, -1.0])
-def test_a_target_is_positive(target_mbits: float) -> None:
-    with pytest.raises(ConfigError, match="it must be positive"):
-        RateController(RateConfig(target_mbits), FPS, keys=KeyFrames(KEY_EVERY, FPS))
 
 
 def left_out(seconds: float) -> Callable[[int], float]:
@@ -213,12 +203,11 @@ def test_a_key_packet_is_saved_for_where_frames_are_left_out() -> None:
     assert sum(size for size, _, _ in later) * 8e-6 / (0.1 * len(later)) == pytest.approx(1.0, rel=0.02)
 
 
-def test_the_rate_and_the_warning_are_those_of_media_time(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_warning_is_of_media_time(caplog: pytest.LogCaptureFixture) -> None:
     run = Run(1.0, lambda index: 0.5)
     with caplog.at_level(logging.WARNING):
         for _ in range(20):
             run.add(100_000)  # 1.6 Mbit/s
-    assert run.controller.rate_mbits == pytest.approx(1.6)
     assert [record.getMessage().split(";")[0] for record in caplog.records] == [
         "Frame 4: the last 5 frames take 1.6 Mbit/s, the target is 1"
     ]

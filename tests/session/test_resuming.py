@@ -38,7 +38,10 @@ def test_the_same_run_may_go_on() -> None:
 def test_what_differs_is_named() -> None:
     other = replace(TINY, rate=RateConfig(1.0), online=replace(TINY.online, iterations=3))
     assert "another configuration: online.iterations, rate.target_mbits differ" in refused(config=to_json(other))
-    assert "another part of it: start differ" in refused(metadata={**METADATA, "start": 2})
+    assert "seed differ. Resume with the same preset" in refused(config=to_json(replace(TINY, seed=3)))
+    assert "another part of it: start differ. Resume with the same capture" in refused(
+        metadata={**METADATA, "start": 2}
+    )
     assert "another part of it: fps differ" in refused(fps=25.0)
 
 

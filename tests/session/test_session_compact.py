@@ -91,16 +91,13 @@ def test_each_frame_starts_from_what_a_reader_sees_and_ends_there() -> None:
     assert max(r.free for r in reports) > 0, "the ball that emerges is patched"
 
 
-def test_steps_are_float32_and_come_from_a_pixel() -> None:
+def test_steps_come_from_a_pixel() -> None:
     header = StreamReader(whole()[0]).header
-    dynamic = CONFIG.online.dynamic
-    assert header.steps.keys() == {p.name for p in parameters_of(dynamic) if p.step}
-    assert all(float(np.float32(step)) == step for step in header.steps.values())
+    assert header.steps.keys() == {p.name for p in parameters_of(CONFIG.online.dynamic) if p.step}
     rig = header.similarity.rig(header.rig)
     pixel = pixel_size(header.reference["anchor_positions"], [rig[name] for name in rig.training])
     assert pixel is not None
     assert header.steps["anchor_positions"] == pytest.approx(0.02 * pixel, rel=1e-2)
-    assert header.reference.keys() == dynamic.difference(["free", "free_births"])
 
 
 def test_anchors_stand_on_their_grid_in_space_order() -> None:

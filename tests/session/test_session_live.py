@@ -2,75 +2,29 @@
 """Sessions of sources whose length nobody knows: asked when the trainer is free, ended, resumed exactly."""
 
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.data.live.resume_cache import ResumeCache, resume_folder
-from structgstream.frames import MultiViewFrame
+from structgstream.data.live.resume_cache import resume_folder
 from structgstream.recorder import record
 from structgstream.session.loop import Session
 from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
-from tests.support.moving_block import PERIODS, RIG, filmed
+from tests.support.moving_block import PERIODS, LiveBlock
 from tests.support.small_presets import QUICK
 
 
-@dataclass
-class Now:
-    """Cameras that film a picture whenever the trainer has done something; nothing is filmed twice.
-
-    Args:
-        folder: of kept frames.
-        frames_to_come: after which it ends.
-        instant: the number of the picture that is filmed now.
-        asked: instants at which a frame was asked for.
-    """
-
-    folder: Path
-    frames_to_come: int
-    resume: bool = False
-    rig: CameraRig = RIG
-    fps: float = 30.0
-    name: str = "now"
-    points: np.ndarray = field(default_factory=lambda: np.random.default_rng(0).normal(size=(40, 3)) * 0.3)
-    asked: list[int] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.instant = 0
-        self._cache = ResumeCache(self.folder, cameras=self.rig.training, resume=self.resume)
-
-    def retain(self, *first: int, last: int) -> None:
-        self._cache.retain(*first, last=last)
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        index = start
-        for frame in self._cache.frames(start) if self.resume else ():
-            yield frame
-            index = frame.index + 1
-        while index < self.frames_to_come:
-            self.asked.append(self.instant)
-            # The film of frame ``index`` is given by its number, so that two runs see the same.
-            frame = MultiViewFrame(index, index / 4, filmed(index))
-            self._cache.store(frame, origin_seconds=0.0)
-            yield frame
-            index += 1
-
-
 def test_the_newest_frame_is_asked_for_when_the_one_before_is_stored(tmp_path: Path) -> None:
-    source = Now(tmp_path / "x.live", 4)
+    source = LiveBlock(tmp_path / "x.sgs", 4)
     pipeline = stream_pipeline(QUICK)
     sink = FileSink(tmp_path / "x.sgs")
     for report in Session(source, sink, pipeline, quickest_backend()).run():
         source.instant = report.index + 1
-    assert source.asked == [0, 1, 2, 3]
+    assert source.filmed == {0: 0, 1: 1, 2: 2, 3: 3}
     with open_stream(tmp_path / "x.sgs") as reader:
         assert reader.complete
         assert [info.pts_seconds for info in reader.packets] == [0.0, 0.25, 0.5, 0.75]
@@ -83,7 +37,7 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
     pipeline, backend = stream_pipeline(config), quickest_backend()
     assert pipeline.method.needs_before, "otherwise no picture is needed again"
     whole = tmp_path / "whole.sgs"
-    for report in record(whole, Now(resume_folder(whole), 6), pipeline, backend).reports:
+    for report in record(whole, LiveBlock(whole, 6), pipeline, backend).reports:
         # What a kill -9 leaves: no index, and the frames that a resumed run needs.
         left = tmp_path / f"{report.index + 1}.sgs"
         shutil.copy(whole, left)
@@ -92,7 +46,7 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
         assert [period.first_frame for period in reader.periods] == [0, 3][: 1 + config.period.enabled]
     for frames in killed_after:
         path = tmp_path / f"{frames}.sgs"
-        again = record(path, Now(resume_folder(path), 6, resume=True), pipeline, backend, resume=True)
+        again = record(path, LiveBlock(path, 6, resume=True), pipeline, backend, resume=True)
         assert again.done == frames
         assert [report.index for report in again.reports] == list(range(frames, 6))
         assert path.read_bytes() == whole.read_bytes()
@@ -100,8 +54,8 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
 
 def test_a_finished_live_stream_can_go_on(tmp_path: Path) -> None:
     pipeline, backend, path = stream_pipeline(QUICK), quickest_backend(), tmp_path / "x.sgs"
-    list(record(path, Now(resume_folder(path), 2), pipeline, backend).reports)
-    again = record(path, Now(resume_folder(path), 4, resume=True), pipeline, backend, resume=True)
+    list(record(path, LiveBlock(path, 2), pipeline, backend).reports)
+    again = record(path, LiveBlock(path, 4, resume=True), pipeline, backend, resume=True)
     assert [report.index for report in again.reports] == [2, 3]
     with open_stream(path) as reader:
         assert reader.complete

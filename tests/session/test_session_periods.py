@@ -3,7 +3,6 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import count
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
-from structgstream.scene.scene import Scene
 from structgstream.session import struct_gstream as method
 from structgstream.session.loop import FrameReport, Session
 from structgstream.session.periods import PeriodConfig
@@ -23,7 +21,6 @@ from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
 from tests.session.test_session_compact import WORLD
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
-from tests.support.streams import same
 
 FRAMES = 8
 CHANGE = 3
@@ -58,29 +55,15 @@ def run(sink, config: StreamConfig, *, resumed=None, length: int = FRAMES) -> li
 
 
 @cache
-def whole(case: str) -> tuple[bytes, list[FrameReport], dict[int, Scene]]:
-    """The stream, the reports, and by frame the scene from which its fit started."""
-    started: dict[int, Scene] = {}
-    fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
-
-    def following(scene, *arguments, **options):
-        started[next(number)] = scene
-        return fit(scene, *arguments, **options)
-
-    def anew(frame, rig, scene, **options):
-        started[next(number)] = scene
-        return again(frame, rig, scene, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(method, "fit_next_frame", following)
-        patch.setattr(method, "fit_first_frame_again", anew)
-        reports = run(sink := MemorySink(), CONFIGS[case][0])
-    return sink.data, reports, started
+def whole(case: str) -> tuple[bytes, list[FrameReport]]:
+    """The stream and the reports."""
+    reports = run(sink := MemorySink(), CONFIGS[case][0])
+    return sink.data, reports
 
 
 @pytest.mark.parametrize("case", CONFIGS)
 def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
-    data, reports, _ = whole(case)
+    data, reports = whole(case)
     reader = StreamReader(data)
     firsts = CONFIGS[case][1]
     assert [period.first_frame for period in reader.periods] == firsts
@@ -93,7 +76,8 @@ def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
 
 @pytest.mark.parametrize("case", CONFIGS)
 def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None:
-    """Stopped before the second period, in its init record, and after its first frame."""
+    """Stopped before the second period, in its init record, and after its first frame: a resumed run has what a reader
+    sees, so the uninterrupted one started from that, too."""
     data = whole(case)[0]
     records = [record for record in scan_records(data) if record.type != RecordType.INDEX]
     (second,) = (number for number, record in enumerate(records) if number and record.type == RecordType.INIT)
@@ -104,13 +88,6 @@ def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None
         sink, resumed = FileSink.resume(path)
         run(sink, CONFIGS[case][0], resumed=resumed)
         assert path.read_bytes() == data, cut
-
-
-def test_each_frame_starts_from_what_a_reader_sees() -> None:
-    """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
-    data, _, started = whole("scheduled")
-    reader = StreamReader(data)
-    assert all(same(started[index], reader.scene(index - 1)) for index in range(1, FRAMES))
 
 
 def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,15 @@
 """``tests/support/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
 
 import importlib
+import io
 import sys
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,18 +19,9 @@ FOLDER = Path(__file__).parent / "senders"
 
 def sender() -> ModuleType:
     """The module, which lies outside of any package."""
-    return _of_the_tool("send")
-
-
-def mpeg_ts() -> ModuleType:
-    """The module beside it that makes MPEG-TS."""
-    return _of_the_tool("mpeg_ts")
-
-
-def _of_the_tool(name: str) -> ModuleType:
     if str(FOLDER) not in sys.path:
         sys.path.append(str(FOLDER))
-    return importlib.import_module(name)
+    return importlib.import_module("send")
 
 
 class Collected:
@@ -44,17 +38,39 @@ class Collected:
         return None
 
 
-def moving_pictures(count: int = 12, *, width: int = 128, height: int = 96) -> list[NDArray[np.uint8]]:
-    """A bright block that moves over a smooth ground, so that no two pictures are alike."""
-    down, across = np.mgrid[:height, :width]
+def moving_pictures() -> list[NDArray[np.uint8]]:
+    """Twelve of 128x96 pixels: a bright block that moves over a smooth ground, so that no two pictures are alike."""
+    down, across = np.mgrid[:96, :128]
     ground = (40 + 60 * np.sin(across / 20) + 40 * np.cos(down / 15)).clip(0, 255)
     pictures = []
-    for number in range(count):
+    for number in range(12):
         picture = np.repeat(ground[..., None], 3, 2).astype(np.uint8)
-        left = 4 + number * (width - 28) // count
+        left = 4 + number * 100 // 12
         picture[20:44, left : left + 20] = (230, 40 + 10 * number, 30)
         pictures.append(picture)
     return pictures
+
+
+def number_shown(image: NDArray[np.uint8]) -> int:
+    """Which of :func:`moving_pictures` it is, decoded; anything else fails."""
+    errors = ((np.stack(moving_pictures()).astype(np.float64) - image) ** 2).mean((1, 2, 3))
+    assert errors.min() < 60, "a picture that was never filmed"
+    return int(errors.argmin())
+
+
+def coded_film(codec: str, numbers: Iterable[int], **options: str) -> bytes:
+    """Pictures of the film of :func:`moving_pictures`, over and over, at the times of their numbers, as MPEG-TS."""
+    written = io.BytesIO()
+    with av.open(written, "w", format="mpegts") as output:
+        stream = output.add_stream(codec, rate=30, options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        for number in numbers:
+            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return written.getvalue()
 
 
 @cache
@@ -63,11 +79,11 @@ def sent_loops() -> dict[str, Any]:
     return sender().loops_of(moving_pictures())
 
 
-def sent_stream(*troubles: str, frames: int = 60, fps: float = 30.0, begun: float = 1000.0) -> bytes:
+def sent_stream(*troubles: str, frames: int = 60, begun: float = 1000.0) -> bytes:
     """What a camera sends in ``frames`` pictures with the troubles ``FAULT:START:LENGTH``, as MPEG-TS."""
     module, line = sender(), Collected()
     parsed = [module.Trouble.parsed(f"a:{trouble}") for trouble in troubles]
-    camera = module.SentCamera("a", sent_loops(), line, fps, parsed)
+    camera = module.SentCamera("a", sent_loops(), line, 30.0, parsed)
     for number in range(frames):
-        camera.send(number, begun=begun, now=begun)
+        camera.send(number, begun=begun)
     return bytes(line.data)

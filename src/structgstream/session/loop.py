@@ -15,7 +15,7 @@ from typing import Generic
 import torch
 
 from structgstream.cameras import CameraRig, Similarity, normalizing_similarity
-from structgstream.codec.container.records import MAX_PERIODS, Period
+from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
 from structgstream.codec.scene_coder import Encoded
@@ -60,8 +60,7 @@ class Session(Generic[State, Memory]):
 
     Raises:
         CalibrationError: the pictures of a camera are larger than a stream allows.
-        ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
-            is not possible.
+        ConfigError: the stream to resume was made with another configuration or from another capture.
     """
 
     def __init__(
@@ -95,7 +94,7 @@ class Session(Generic[State, Memory]):
             metadata={"capture": source.name, **pipeline.metadata, **roving, **(metadata or {})},
         )
         self._keys = KeyFrames(pipeline.codec.key_interval(source.fps), source.fps)
-        self._plan = PeriodPlan(pipeline.period, most=MAX_PERIODS)
+        self._plan = PeriodPlan(pipeline.period)
         self._controller = RateController(pipeline.rate, source.fps, keys=self._keys)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Literal
 
+from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
 
@@ -104,9 +105,9 @@ class PeriodConfig:
 
 class PeriodPlan:
     """Finds the frames that begin another period, from times and residuals of the frames before them; the last of
-    ``most`` periods does not end. Raises ConfigError if a value is out of range."""
+    :data:`MAX_PERIODS` does not end. Raises ConfigError if a value is out of range."""
 
-    def __init__(self, config: PeriodConfig, *, most: int) -> None:
+    def __init__(self, config: PeriodConfig) -> None:
         for name, value, least in (("seconds", config.seconds, 0.0), ("residual", config.residual, 1.0)):
             if value is not None and not least < value < math.inf:
                 raise ConfigError(f"--period.{name} {value:g} is not above {least:g}; leave it out for no limit.")
@@ -115,7 +116,7 @@ class PeriodPlan:
                 f"--period.frames {config.frames} and --period.share {config.share:g}: frames must be at least 1, and "
                 "the share above 0 and at most 1."
             )
-        self._config, self._most = config, most
+        self._config = config
         self._number = 0
         self._first: tuple[int, float] | None = None  # frame and time of the period's first frame
         self._floor = math.inf
@@ -123,7 +124,7 @@ class PeriodPlan:
 
     def due(self, index: int, pts_seconds: float) -> str | None:
         """Why key frame ``index`` begins another period, in a few words; None if it does not."""
-        if self._first is None or self._number + 1 >= self._most:
+        if self._first is None or self._number + 1 >= MAX_PERIODS:
             return None
         config, seconds = self._config, pts_seconds - self._first[1]
         # Tolerance for times, which are sums of rounded numbers.

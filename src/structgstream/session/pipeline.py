@@ -2,7 +2,7 @@
 """Protocols of a pipeline: a method that fits frames, and a codec that stores them.
 
 Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``); another method would be another pipeline.
-``session.py`` runs any of them.
+``loop.py`` runs any of them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -2,7 +2,7 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
@@ -34,38 +34,13 @@ SIGNED = frozenset({"quality", "tiles_around"})
 """Fields that may be negative."""
 SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "occluded_share"})
 """Fields that are at most 1."""
-POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
+POSITIVE = frozenset({"picture_scale", "key_interval_seconds", "target_mbits"})
 """Fields that must not be 0."""
 _KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
 
 
-def holds(found: Any, given: Any) -> bool:
-    """Whether ``found`` has all that is ``given``."""
-    if isinstance(given, list) and isinstance(found, list):
-        return len(found) == len(given) and all(map(holds, found, given))
-    if isinstance(given, dict) and isinstance(found, dict):
-        return all((key == "period" and key not in found) or holds(found.get(key), item) for key, item in given.items())
-    return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
-
-
-def _is_number(*values: Any) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-
-
-def unknown_fields(kind: Any, values: Any, path: str = "") -> Iterator[str]:
-    """Paths in ``values`` of fields that the dataclass ``kind`` lacks."""
-    hints = get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
-    for name, item in values.items() if hints and isinstance(values, Mapping) else ():
-        if name not in hints:
-            yield f"{path}{name}"
-        else:
-            yield from unknown_fields(hints[name], item, f"{path}{name}.")
-
-
 def plain_value(value: Any) -> Any:
-    """``value``, of a configuration, as plain JSON values."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain_value(asdict(value))
+    """``value``, of the dictionary of a configuration, as plain JSON values."""
     if isinstance(value, dict):
         return {key: plain_value(item) for key, item in value.items()}
     if isinstance(value, frozenset | set):
@@ -102,18 +77,32 @@ def _check_number(value: float, name: str, where: str) -> None:
         raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
 
 
-def read_value(kind: Any, value: Any) -> Any:
-    """``value``, plain JSON, as a ``kind``: a dataclass, a container, or what JSON has itself."""
+def read_value(kind: Any, value: Any, path: str = "") -> Any:
+    """``value``, plain JSON, as a ``kind``: a dataclass, a container, or what JSON has itself; ``path`` is where it is.
+
+    Raises:
+        ConfigError: a dataclass lacks the field, or has no such value.
+        TypeError, ValueError, AttributeError: it is of another kind.
+    """
     if isinstance(kind, type) and is_dataclass(kind):
         hints = get_type_hints(kind)
-        return kind(**{name: read_value(hints[name], item) for name, item in value.items()})
+        if unknown := [name for name, _ in value.items() if name not in hints]:
+            raise ConfigError(
+                f"The header's configuration has the field {path}{unknown[0]}, which this version of structgstream "
+                "does not have; continue the stream with the version that began it."
+            )
+        return kind(**{name: read_value(hints[name], item, f"{path}{name}.") for name, item in value.items()})
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         (kind,) = (of for of in arguments if of is not type(None))
-        return None if value is None else read_value(kind, value)
-    if origin is tuple:
-        return tuple(read_value(arguments[0], item) for item in value)
-    return origin(value) if origin in (frozenset, dict) else value
+        return None if value is None else read_value(kind, value, path)
+    if origin in (tuple, frozenset):
+        if not isinstance(value, list):
+            raise TypeError(value)
+        return origin(read_value(arguments[0], item) for item in value)
+    if origin is Literal and value not in arguments:
+        raise ValueError(value)
+    return value
 
 
 MAX_QUALITY = 6.0  # steps 64 times as small, or as large
@@ -156,7 +145,7 @@ class StreamConfig:
 
 def to_json(config: StreamConfig) -> dict[str, Any]:
     """The resolved configuration as plain JSON values: what a stream's header stores."""
-    found = plain_value(config)
+    found = plain_value(asdict(config))
     if found.get("period") == asdict(PeriodConfig()):
         del found["period"]
     rates = found.get("online", {}).get("rates", {})
@@ -173,18 +162,10 @@ def from_json(values: Mapping[str, Any]) -> StreamConfig:
     Raises:
         ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
-    if unknown := [*unknown_fields(StreamConfig, values)]:
-        raise ConfigError(
-            f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
-            "have; continue the stream with the version that began it."
-        )
     try:
-        config = read_value(StreamConfig, values)
-        if holds(to_json(config), dict(values)):
-            return config
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        return read_value(StreamConfig, values)
+    except (TypeError, ValueError, AttributeError) as error:
         raise ConfigError("The header's configuration has a value of another kind than its field.") from error
-    raise ConfigError("The header's configuration has a value of another kind than its field.")
 
 
 def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:

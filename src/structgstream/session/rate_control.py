@@ -33,7 +33,6 @@ from itertools import takewhile
 from typing import ClassVar
 
 from structgstream.codec.packets import PacketKind
-from structgstream.errors import ConfigError
 from structgstream.session.periods import KeyFrames
 from structgstream.training.online.config import OnlineConfig
 
@@ -73,8 +72,7 @@ class RateController:
 
     The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
     about the cube root of lambda, so each step corrects about a third of the excess. ``keys`` must receive each packet
-    before this object does. A warning is logged when the target starts to be missed. Raises ConfigError if the target
-    is not positive.
+    before this object does. A warning is logged when the target starts to be missed.
     """
 
     def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:
@@ -83,8 +81,6 @@ class RateController:
         self._budget: float | None = None  # bytes per frame of the media
         if config.target_mbits is None:
             return
-        if config.target_mbits <= 0:
-            raise ConfigError(f"A target of {config.target_mbits:g} Mbit/s; it must be positive.")
         window = max(2, round(config.WINDOW_SECONDS * fps), keys.interval)
         self._budget = config.target_mbits * 1e6 / 8.0 / fps
         self._fps, self._keys, self._window = fps, keys, window
@@ -114,11 +110,14 @@ class RateController:
             last, pressure = self._delta
             factor = min(max(last / self._room(self._budget), _FALL), _RISE)
             self.pressure = min(max(pressure * factor, LEAST), MOST)
-        self._warn_if_missed(index)
+        self._warn_if_missed(index, self._budget)
 
-    def _warn_if_missed(self, index: int) -> None:
-        """Warns once when the target starts to be missed."""
-        if self.missed and not self._warned:
+    def _warn_if_missed(self, index: int, budget: float) -> None:
+        """Warns once when the target starts to be missed: a complete window exceeds it by more than :data:`_MISSED`."""
+        packets = self._written()
+        rate = sum(one.size for one in packets) / self._span(packets)  # bytes per frame of the media
+        missed = len(packets) >= self._packets_of_window and rate > _MISSED * budget
+        if missed and not self._warned:
             remedy = (
                 "nothing more can be saved: take coarser steps (online.rounding.quality), spawn fewer Gaussians "
                 "(online.spawn.most) or take a higher target"
@@ -126,12 +125,12 @@ class RateController:
             _log.warning(
                 "Frame %d: the last %d frames take %.3g Mbit/s, the target is %.3g; %s.",
                 index,
-                len(self._written()),
-                self.rate_mbits,
-                (self._budget or 0.0) * 8e-6 * self._fps,
+                len(packets),
+                rate * 8e-6 * self._fps,
+                budget * 8e-6 * self._fps,
                 remedy if self.pressure == MOST else "bytes are saved from now on",
             )
-        self._warned = self.missed
+        self._warned = missed
 
     def _room(self, budget: float) -> float:
         """Budget of the next delta packet in bytes (Note [Windows])."""
@@ -174,23 +173,6 @@ class RateController:
     def _span(self, packets: Sequence["_Written"]) -> float:
         """Frames of the media from the first of these packets to the one after the last."""
         return packets[-1].place - packets[0].place + self._spacing if packets else 0.0
-
-    @property
-    def rate_mbits(self) -> float | None:
-        """Rate of the last window; None without a target."""
-        if self._budget is None or not self._last:
-            return None
-        packets = self._written()
-        return sum(one.size for one in packets) * 8e-6 * self._fps / self._span(packets)
-
-    @property
-    def missed(self) -> bool:
-        """Whether a complete window exceeds its budget by more than :data:`_MISSED` allows."""
-        if self._budget is None or not self._last:
-            return False
-        packets = self._written()
-        complete = len(packets) >= self._packets_of_window
-        return complete and sum(one.size for one in packets) > _MISSED * self._budget * self._span(packets)
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:

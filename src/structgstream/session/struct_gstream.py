@@ -3,7 +3,7 @@
 scenes, ``raw`` and ``compact``, with their headers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -34,7 +34,12 @@ from structgstream.session.pipeline import FrameTask, Past, Pipeline, StreamFact
 from structgstream.session.presets import StreamConfig, to_json
 from structgstream.session.rate_control import with_rate_control
 from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
-from structgstream.training.frame0.quantization import estimate_sensitivity, quantize_first_frame, regauge
+from structgstream.training.frame0.quantization import (
+    Sensitivity,
+    estimate_sensitivity,
+    quantize_first_frame,
+    regauge,
+)
 from structgstream.training.frame0.seeding import fit_environment
 from structgstream.training.online.exposure import ExposureReference, exposure_reference
 from structgstream.training.online.fit import fit_next_frame, needs_older
@@ -43,14 +48,6 @@ from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
 from structgstream.training.result import FitResult
 from structgstream.training.views import View
-
-
-@dataclass(frozen=True)
-class QuantizationSteps:
-    """Quantization steps of a stream, as stored in the header; empty with codec ``raw``."""
-
-    steps: Mapping[str, float] = field(default_factory=dict)  # steps of packets, by parameter
-    init_steps: Mapping[FieldName, float] = field(default_factory=dict)  # steps of the init record, by field
 
 
 @dataclass(frozen=True)
@@ -86,9 +83,18 @@ class SceneCodec:
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
         """The reconstruction of a period's first frame, which later frames and receivers use, and its header."""
-        scene, step_sizes = self._initialize_stream(fitted, task)
+        steps: Mapping[str, float] = {}  # of packets, by parameter
+        init_steps: Mapping[FieldName, float] = {}  # of the init record
+        if self.config.codec == "raw":
+            scene = self._with_dynamic_fields(fitted)
+        else:
+            measured = estimate_sensitivity(fitted, task.rig, backend=task.backend, seed=task.seed)
+            scene, sensitivity = regauge(fitted, measured)
+            scene = self._with_dynamic_fields(scene)
+            steps = self._packet_steps(scene, task.rig)
+            scene, init_steps = self._quantized(scene, sensitivity, steps)
         state, dynamic = state_of(scene), self.config.online.dynamic
-        reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
+        reference = dynamic.difference(fields_of("free")) if steps else ()
         header = StreamHeader(
             rig=facts.rig,
             similarity=facts.similarity,
@@ -99,38 +105,37 @@ class SceneCodec:
             distance_input=scene.distance_input,
             config=facts.config,
             metadata=facts.metadata,
-            steps=step_sizes.steps,
+            steps=steps,
             reference={name: state[name].cpu() for name in reference},
-            init_steps=step_sizes.init_steps,
+            init_steps=init_steps,
             periods=self.config.period.enabled,
         )
         return scene, header
 
-    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
-        """The reconstruction of frame 0, as a receiver decodes it, and its steps."""
-        if self.config.codec == "raw":
-            return self._with_dynamic_fields(scene), QuantizationSteps()
-        dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
-        scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
-        scene = self._with_dynamic_fields(scene)
-        pixel = pixel_size(scene.anchors.positions, [task.rig[name] for name in task.rig.training])
+    def _packet_steps(self, scene: Scene, rig: CameraRig) -> dict[str, float]:
+        """The quantization steps of packets, by parameter."""
+        pixel = pixel_size(scene.anchors.positions, [rig[name] for name in rig.training])
         if pixel is None:
             raise CalibrationError(
                 "No training camera sees an anchor of frame 0, so positions have no step; check the calibration with "
                 "structgstream prepare --check."
             )
-        known = rounding.steps(pixel)
-        used = {parameter.name for parameter in parameters_of(dynamic)}
-        steps = {name: float32(step) for name, step in known.items() if name in used}
-        voxel_size = self.config.initial.voxel_size
+        used = {parameter.name for parameter in parameters_of(self.config.online.dynamic)}
+        known = self.config.online.rounding.steps(pixel)
+        return {name: float32(step) for name, step in known.items() if name in used}
+
+    def _quantized(
+        self, scene: Scene, sensitivity: Sensitivity, steps: Mapping[str, float]
+    ) -> tuple[Scene, Mapping[FieldName, float]]:
+        """Frame 0 as a receiver decodes it, and the quantization steps of the init record."""
+        rounding, voxel_size = self.config.online.rounding, self.config.initial.voxel_size
         scene, init_steps = quantize_first_frame(
             scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps
         )
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.STEP)
         rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        scene = scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling)
-        return scene, QuantizationSteps(steps, init_steps)
+        return scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling), init_steps
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
         """``scene`` with all dynamic fields; dynamic appearance gets its basis."""

@@ -9,81 +9,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.live.ingest import FrameBuffer, Ingest
+from structgstream.data.live.ingest import Ingest
 from structgstream.data.live.rig_file import LiveCamera, LiveRig
 from structgstream.data.live.status import FaultLog
-from structgstream.data.live.synchronizer import LivePicture, PictureSet
-from structgstream.frames import MultiViewFrame
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
 
 SIZE = (64, 48)
 PERIOD = 1 / 30
 
 
-def convert(pictures: PictureSet) -> MultiViewFrame:
-    return MultiViewFrame(0, pictures.seconds, {})
-
-
-class Stored(FrameBuffer):
-    """A buffer that keeps all sets, and may fail."""
-
-    def __init__(self, *, fails: Exception | None = None) -> None:
-        super().__init__(convert)
-        self.sets: list[PictureSet] = []
-        self.waiting, self._fails = False, fails
-
-    def put(self, pictures: PictureSet) -> None:
-        if self._fails is not None:
-            raise self._fails
-        self.sets.append(pictures)
-
-    @property
-    def is_empty(self) -> bool:
-        return not self.waiting
-
-
-def one_set(number: int) -> PictureSet:
-    return PictureSet(float(number), {"a": LivePicture(float(number), float(number), number)}, float(number))
-
-
-def test_a_buffer_delivers_the_newest_set_and_counts_the_others() -> None:
-    buffer = FrameBuffer(convert)
-    assert buffer.take(0.0) is None
-    for number in range(5):
-        buffer.put(one_set(number))
-    frame = buffer.take(0.0)
-    assert frame is not None
-    assert frame.pts_seconds == 4.0
-    assert buffer.times is not None
-    assert buffer.times[1] == 4.0
-    assert buffer.take(0.0) is None
-    assert buffer.skipped == 4
-
-
-def test_a_buffer_wakes_the_thread_that_waits() -> None:
-    buffer, found = FrameBuffer(convert), []
-    waiting = threading.Thread(target=lambda: found.append(buffer.take(10.0)))
-    waiting.start()
-    buffer.put(one_set(3))
-    waiting.join(10.0)
-    assert found[0].pts_seconds == 3.0
-
-
 class Bench:
     """Ingest of cameras that nobody opens, in a time that a test moves."""
 
-    def __init__(self, *names: str, end_seconds: float | None = None, fails: Exception | None = None) -> None:
-        self.now = 100.0
-        self.buffer, self.faults = Stored(fails=fails), FaultLog("rig", now=lambda: self.now)
+    def __init__(self, *names: str, end_seconds: float | None = None) -> None:
+        self.now, faults = 100.0, FaultLog("rig", now=lambda: 0.0)
         cameras = {name: LiveCamera("udp://nowhere") for name in names}
         rig = LiveRig("rig", Path("nowhere"), cameras, deadline_seconds=0.5, end_seconds=end_seconds)
         self.ingest = Ingest(
-            rig, sizes=dict.fromkeys(names, SIZE), fps=30.0, faults=self.faults, buffer=self.buffer, recording=None,
-            now=lambda: self.now, unix_offset=0.0,
+            rig, sizes=dict.fromkeys(names, SIZE), fps=30.0, faults=faults, recording=None, now=lambda: self.now,
+            unix_offset=0.0,
         )  # fmt: skip
 
     def send(self, seconds: float, *names: str) -> None:
         for name in names:
-            self.ingest.deliver(name, LivePicture(seconds, seconds, np.zeros(1)))
+            self.ingest._synchronizer.add(name, LivePicture(seconds, seconds, np.zeros(1)))
 
     def running(self) -> "Bench":
         """With the thread that makes sets, without those of cameras."""
@@ -97,15 +46,24 @@ class Bench:
             time.sleep(0.005)
 
 
-def test_sets_go_to_the_buffer() -> None:
-    bench = Bench("a", "b").running()
+def test_the_newest_set_is_taken_and_the_others_are_counted() -> None:
+    bench, found = Bench("a", "b").running(), []
     for index in range(3):
         bench.now = 100.0 + index * PERIOD
         bench.send(bench.now, "a", "b")
         bench.wait(index + 1)
-    assert [set(one.pictures) for one in bench.buffer.sets] == [{"a", "b"}] * 3
+    newest = bench.ingest.take(0.0)
+    assert newest is not None
+    assert (newest.seconds, set(newest.pictures)) == (bench.now, {"a", "b"})
+    assert bench.ingest.skipped_sets == 2
     assert bench.ingest.present == ["a", "b"]
     assert bench.ingest.queue_lengths == {"a": 0, "b": 0}
+    waiting = threading.Thread(target=lambda: found.append(bench.ingest.take(10.0)))
+    waiting.start()
+    bench.now += PERIOD
+    bench.send(bench.now, "a", "b")
+    waiting.join(10.0)
+    assert found[0].seconds == bench.now
     bench.ingest._stop.set()
 
 
@@ -120,15 +78,18 @@ def test_who_sends_is_present_until_the_deadline() -> None:
     assert bench.ingest.describe_absent() == "2 of 3 cameras send; absent: c"
     bench.send(101.1, "c")
     assert bench.ingest.describe_absent() == "3 of 3 cameras send; absent: none"
-    bench.ingest.mark_absent("a")
+    bench.ingest._synchronizer.mark_absent("a")
     assert "absent: a" in bench.ingest.describe_absent()
     bench.now = 101.55
     assert bench.ingest.present == ["c"]
 
 
-def test_an_error_of_the_buffer_reaches_the_trainer() -> None:
-    bench = Bench("a", fails=OSError("the disk is gone")).running()
-    bench.send(100.0, "a")
+def test_an_error_of_the_synchronizer_reaches_the_trainer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(synchronizer: FrameSynchronizer, now: float) -> None:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(FrameSynchronizer, "next_set", fails)
+    bench = Bench("a").running()
     last = time.monotonic() + 20.0
     while bench.ingest._failure is None:
         assert time.monotonic() < last
@@ -138,17 +99,19 @@ def test_an_error_of_the_buffer_reaches_the_trainer() -> None:
 
 
 def test_a_silent_rig_ends_after_its_time_and_not_while_sets_wait() -> None:
-    bench = Bench("a", "b", end_seconds=10.0)
-    bench.send(103.0, "a")
+    bench = Bench("a", "b", end_seconds=10.0).running()
+    bench.send(103.0, "a", "b")
+    bench.wait(1)
+    bench.now = 114.0
+    assert bench.ingest.end_reason is None
+    bench.ingest.take(0.0)
     bench.now = 113.0
     assert bench.ingest.end_reason is None
     bench.now = 114.0
-    bench.buffer.waiting = True
-    assert bench.ingest.end_reason is None
-    bench.buffer.waiting = False
     assert bench.ingest.end_reason == (
         "no camera has sent a picture for 11 s, so the stream ends (end_seconds in the rig file)"
     )
+    bench.ingest._stop.set()
     assert Bench("a").ingest.end_reason is None
 
 
@@ -160,19 +123,11 @@ def test_files_that_end_end_the_stream_when_everything_was_taken() -> None:
     assert bench.ingest.end_reason is None
     bench.running().wait(1)
     bench.ingest._stop.set()
-    bench.buffer.waiting = True
     assert bench.ingest.end_reason is None
-    bench.buffer.waiting = False
+    bench.ingest.take(0.0)
     assert bench.ingest.end_reason == "all files of cameras have come to their end, or cannot be read"
     bench.ingest.feeds["b"].ended = False
     assert bench.ingest.end_reason is None
-
-
-def test_others_that_change_are_those_of_other_cameras() -> None:
-    bench = Bench("a", "b")
-    bench.ingest.feeds["a"].changed_at = 7.0
-    assert bench.ingest.others_changed_at("b") == 7.0
-    assert Bench("a").ingest.others_changed_at("a") == -float("inf")
 
 
 @pytest.mark.parametrize(
@@ -190,3 +145,8 @@ def test_a_camera_out_of_step_is_reported_with_its_remedy(
     (record,) = caplog.records
     assert "b" in record.getMessage()
     assert re.search(said, record.getMessage())
+
+
+def test_each_camera_knows_when_the_others_changed() -> None:
+    first, second = Bench("a", "b").ingest.feeds.values()
+    assert first._changed_at is second._changed_at

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lenses, masks and sizes of a calibration on pictures that arrive."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,7 @@ import pytest
 
 from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.live.source import (
-    LivePictures,
-    filmed_sizes,
-    read_calibration,
-    with_calibration,
-)
+from structgstream.data.live.source import LiveOptions, LiveSource, read_calibration
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, filmed_rig, write_prepared
 from structgstream.data.undistortion import Undistortion
 from structgstream.frames import MultiViewFrame
@@ -36,35 +30,27 @@ def prepared(folder: Path) -> PreparedCapture:
     return capture
 
 
-def test_a_prepared_capture_needs_its_file_alone(tmp_path: Path) -> None:
-    capture = prepared(tmp_path)
-    read = read_calibration(tmp_path)
-    assert (read.fps, read.held_out, [*read.cameras]) == (25.0, capture.held_out, [*capture.cameras])
-
-
 def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
-    capture = prepared(tmp_path)
+    capture, path = prepared(tmp_path), tmp_path / "rig.toml"
     filmed = filmed_rig(tmp_path, capture)
+    path.write_text('calibration = "."\n' + "".join(f'[cameras.{name}]\nurl = "udp://nowhere"\n' for name in filmed))
     random = np.random.default_rng(0)
     images = {
-        name: random.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
-        for name, size in filmed_sizes(capture).items()
+        name: random.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
+        for name, camera in filmed.cameras.items()
     }
     frames = [MultiViewFrame(0, 3.25, images, captured_unix_seconds=5.0)]
-    arriving = LivePictures("live", filmed, 25.0, iter(frames))
-    source = with_calibration(arriving, capture, tmp_path, held_out=None, scale=1.0, near=0.3)
-    (frame,) = source.frames()
+    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(near=0.3))
+    (frame,) = source._calibrated(iter(frames)).frames()
     second = [*images][1]
     expected = Undistortion(capture.cameras[second].filmed, capture.cameras[second].pinhole)(images[second])
     assert (frame.images[second] == expected).all()
     assert (expected != images[second]).any()
     assert (frame.pts_seconds, frame.captured_unix_seconds) == (3.25, 5.0)
     assert source.rig[second].near == 0.3
-    half = with_calibration(
-        replace(arriving, arriving=iter(frames)), capture, tmp_path, held_out=(second,), scale=0.5, near=None
-    )
+    half = LiveSource(path, tmp_path / "x.sgs", LiveOptions(held_out=(second,), scale=0.5))
     assert half.rig.testing == (second,)
-    (small,) = half.frames()
+    (small,) = half._calibrated(iter(frames)).frames()
     assert small.images[second].shape == (half.rig[second].height, half.rig[second].width, 3)
     assert half.rig[second].width == round(filmed[second].width / 2)
 

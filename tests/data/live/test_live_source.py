@@ -5,7 +5,7 @@ import io
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
@@ -30,7 +30,7 @@ from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.opus import PACKET_SECONDS
 from tests.support.captures import write_picture
 from tests.support.rigs import arc_rig
-from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream
+from tests.support.sender_modules import coded_film, moving_pictures, number_shown, sender, sent_loops, sent_stream
 from tests.support.sounds import add_sound, claps, packets_heard
 from tests.support.varied import varied
 
@@ -90,24 +90,6 @@ def sending(transport: str, *troubles: str) -> Iterator[dict[str, str]]:
             line.close()
 
 
-def shown(image: np.ndarray) -> int:
-    """Which picture of the film it is."""
-    errors = ((np.stack(moving_pictures()).astype(float) - image) ** 2).mean((1, 2, 3))
-    assert errors.min() < 60
-    return int(errors.argmin())
-
-
-class Recorded(recording.Recording):
-    """Where nothing is written."""
-
-    def __init__(self) -> None:
-        return None
-
-
-def decoded() -> av.VideoFrame:
-    return av.VideoFrame.from_ndarray(moving_pictures()[0], format="rgb24").reformat(format="yuv420p")
-
-
 @pytest.mark.parametrize("transport", ["udp", "tcp", "http"])
 def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: str) -> None:
     with sending(transport) as urls:
@@ -119,7 +101,7 @@ def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: st
     assert frames[0].pts_seconds == 0.0
     assert all(one.pts_seconds < other.pts_seconds for one, other in pairwise(frames))
     for frame in frames:
-        assert len({shown(image) for image in frame.images.values()}) == 1, "pictures of one instant"
+        assert len({number_shown(image) for image in frame.images.values()}) == 1, "pictures of one instant"
         assert frame.captured_unix_seconds is not None
     assert [*frames[0].images] == list(NAMES)
     status = source.status()
@@ -177,7 +159,7 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
     with caplog.at_level(logging.WARNING):
         frames = list(source.frames())
     numbers = [round(frame.pts_seconds * FPS) for frame in frames]
-    assert [shown(frame.images["a"]) for frame in frames] == [n % 12 for n in numbers]
+    assert [number_shown(frame.images["a"]) for frame in frames] == [n % 12 for n in numbers]
     assert np.allclose([frame.pts_seconds for frame in frames], np.array(numbers) / FPS, atol=1e-4)
     assert all(len(frame.images) == 3 for frame in frames)
     skipped = source.status().skipped_sets
@@ -189,15 +171,18 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
 def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
     tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Frame 0 does not wait for it either."""
-    path = files(tmp_path)
+    """Frame 0 does not wait for it either, and a recording does not name it: that would be refused as a capture."""
+    path, folder = files(tmp_path), tmp_path / "take"
     (tmp_path / "a.ts").unlink()
     if content is not None:
         (tmp_path / "a.ts").write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions()).frames())
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     assert len(frames) >= 20
     assert all([*frame.images] == ["b", "c"] for frame in frames)
+    again = open_capture(folder)
+    assert [*again.rig] == ["b", "c"]
+    assert len(again) == 30
     (reported,) = [text for text in caplog.messages if "camera 'a'" in text]
     assert f"its file {tmp_path / 'a.ts'} cannot be read (" in reported
     assert "correct its url in the rig file, or give follow = true" in reported
@@ -273,7 +258,7 @@ def test_what_is_recorded_is_a_capture_of_the_same_instants(tmp_path: Path) -> N
     assert again.fps == FPS
     assert len(recorded) == 30
     for frame in recorded:
-        assert {shown(image) for image in frame.images.values()} == {frame.index % 12}
+        assert {number_shown(image) for image in frame.images.values()} == {frame.index % 12}
     # What was lost live is lost again, and nothing else.
     for frame in live:  # fewer where this machine was too slow
         assert ("b" in frame.images) == ("b" in recorded[round(frame.pts_seconds * FPS)].images)
@@ -306,7 +291,7 @@ def test_pictures_of_other_proportions_are_not_recorded(tmp_path: Path) -> None:
     recorded = list(open_capture(folder).frames())
     assert {frame.index for frame in recorded if "c" not in frame.images} >= set(range(12, 24))
     for frame in recorded:
-        assert all(shown(image) == frame.index % 12 for image in frame.images.values())
+        assert all(number_shown(image) == frame.index % 12 for image in frame.images.values())
 
 
 def test_a_recording_that_is_cut_can_be_read_up_to_there(tmp_path: Path) -> None:
@@ -317,7 +302,7 @@ def test_a_recording_that_is_cut_can_be_read_up_to_there(tmp_path: Path) -> None
         file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3 // 188 * 188])
     again = open_capture(folder)
     assert 15 <= len(again) < 30
-    assert all(shown(frame.images["c"]) == frame.index % 12 for frame in again.frames() if "c" in frame.images)
+    assert all(number_shown(frame.images["c"]) == frame.index % 12 for frame in again.frames() if "c" in frame.images)
 
 
 def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,30 +311,8 @@ def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeyp
     folder = tmp_path / "take"
     list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
-    assert [shown(frame.images["b"]) for frame in first] == list(range(12))
-    assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
-
-
-def coded(codec: str, numbers: Iterable[int]) -> bytes:
-    """These pictures of the film as a transport stream, at their times."""
-    written = io.BytesIO()
-    with av.open(written, "w", format="mpegts") as output:
-        stream = output.add_stream(codec, rate=30, options={"g": "6", "bf": "0", "tune": "zerolatency"})
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
-        for number in numbers:
-            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
-            frame.pts = number
-            output.mux(stream.encode(frame))
-        output.mux(stream.encode(None))
-    return written.getvalue()
-
-
-def record(recorder: recording.CameraRecorder, stream: bytes) -> None:
-    with av.open(io.BytesIO(stream), "r") as container:
-        for packet in container.demux(video=0):
-            if packet.size:
-                recorder.record(packet, shift_seconds=0.0)
+    assert [number_shown(frame.images["b"]) for frame in first] == list(range(12))
+    assert [number_shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
 
 
 def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tmp_path: Path) -> None:
@@ -359,24 +322,18 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
     for first in range(0, 48, 12):
         for name in ("b", "a", "c"):
             codec = "mpeg2video" if name == "b" and first >= 24 else "libx264"
-            record(recorders[name], coded(codec, range(first, first + 12)))
+            film = coded_film(codec, range(first, first + 12), g="6", bf="0", tune="zerolatency")
+            with av.open(io.BytesIO(film), "r") as container:
+                for packet in container.demux(video=0):
+                    if packet.size:
+                        recorders[name].record(packet, shift_seconds=0.0)
     kept.close()
     assert not (folder / "part-002").exists(), "one change, one part"
     parts = [list(open_capture(part).frames()) for part in (folder, folder / "part-001")]
     assert [len(frames) for frames in parts] == [24, 24]
     for frame in (*parts[0], *parts[1]):
-        assert {shown(image) for image in frame.images.values()} == {frame.index % 12}
+        assert {number_shown(image) for image in frame.images.values()} == {frame.index % 12}
         assert [*frame.images] == list(NAMES)
-
-
-def test_a_recording_names_the_cameras_that_sent_something(tmp_path: Path) -> None:
-    """Its capture would be refused otherwise, for a file that was never there."""
-    path, folder = files(tmp_path), tmp_path / "take"
-    (tmp_path / "a.ts").unlink()
-    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
-    again = open_capture(folder)
-    assert [*again.rig] == ["b", "c"]
-    assert len(again) == 30
 
 
 def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
@@ -398,7 +355,7 @@ def test_a_recording_that_cannot_be_ended_does_not_end_the_others(caplog: pytest
         def close(self) -> None:
             raise OSError(28, "No space left on device")
 
-    recorder = recording.CameraRecorder(Recorded(), "b", FaultLog("rig", now=lambda: 0.0))
+    recorder = recording.CameraRecorder(None, "b", FaultLog("rig", now=lambda: 0.0))  # type: ignore[arg-type]
     recorder._output = Full()
     recorder.close()
     recorder.close()
@@ -414,12 +371,11 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
         return srgb(frame, *rest, width=width, height=height)
 
     monkeypatch.setattr(source_module, "srgb", converted)
-    sizes = {"a": (128, 96), "b": (64, 48), "c": (128, 96)}
-    monkeypatch.setattr(source_module, "filmed_sizes", lambda calibration: sizes)
-    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(frames=0))
-    convert = source._converter()
-    pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
-    assert [*convert(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs")
+    source._sizes["b"] = 64, 48
+    shot = av.VideoFrame.from_ndarray(moving_pictures()[0], format="rgb24").reformat(format="yuv420p")
+    pictures = {name: LivePicture(0.5, 0.0, shot) for name in NAMES}
+    assert [*source._converted(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
     assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
     assert source.faults.counts["b"] == {"garbage": 1}
 
@@ -468,7 +424,7 @@ def test_the_sound_of_a_camera_is_in_step_with_the_pictures(tmp_path: Path, cloc
     feed, packets, expected = source.sound.open(), [], []
     for frame in source.frames():
         packets += feed.until(frame.pts_seconds + 1 / FPS)
-        expected.append(frame.pts_seconds + 0.5 - shown(frame.images["b"]) / FPS)
+        expected.append(frame.pts_seconds + 0.5 - number_shown(frame.images["b"]) / FPS)
         time.sleep(0.1)
     packets += feed.until(10.0)
     times = [packet.seconds for packet in packets]

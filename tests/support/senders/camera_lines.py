@@ -3,7 +3,7 @@
 
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from rtsp import RtspCamera
@@ -42,9 +42,9 @@ class Served:
     A new connection begins with a key frame, because a muxer begins anew whenever :attr:`fresh` is set.
     """
 
-    def __init__(self, port: int = 0, *, http: bool) -> None:
+    def __init__(self, *, http: bool) -> None:
         self._http = http
-        self._listener = socket.create_server(("127.0.0.1", port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
@@ -97,30 +97,19 @@ class Served:
 
 def opened_lines(transport: str, names: Sequence[str]) -> tuple[dict[str, Line | RtspCamera], dict[str, str]]:
     """A line for each camera, and its address for a rig file."""
-    made: dict[str, Callable[[], tuple[Line | RtspCamera, str]]]
-    made = {"udp": _udp, "tcp": _tcp, "http": _http, "rtsp": _rtsp}
-    pairs = {name: made[transport]() for name in names}
-    return {name: line for name, (line, _) in pairs.items()}, {name: url for name, (_, url) in pairs.items()}
-
-
-def _udp() -> tuple[Line, str]:
-    port = free_port()
-    return Udp(port), f"udp://127.0.0.1:{port}"
-
-
-def _tcp() -> tuple[Line, str]:
-    served = Served(http=False)
-    return served, f"tcp://127.0.0.1:{served.port}"
-
-
-def _http() -> tuple[Line, str]:
-    served = Served(http=True)
-    return served, f"http://127.0.0.1:{served.port}/"
-
-
-def _rtsp() -> tuple[RtspCamera, str]:
-    camera = RtspCamera()
-    return camera, camera.url
+    lines: dict[str, Line | RtspCamera] = {}
+    urls = {}
+    for name in names:
+        if transport == "rtsp":
+            lines[name] = camera = RtspCamera()
+            urls[name] = camera.url
+        elif transport == "udp":
+            port = free_port()
+            lines[name], urls[name] = Udp(port), f"udp://127.0.0.1:{port}"
+        else:
+            lines[name] = served = Served(http=transport == "http")
+            urls[name] = f"{transport}://127.0.0.1:{served.port}/"
+    return lines, urls
 
 
 def free_port() -> int:

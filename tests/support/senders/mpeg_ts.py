@@ -30,12 +30,12 @@ class Loop:
     packets: Sequence[bytes]
 
     @classmethod
-    def of(cls, pictures: Sequence[NDArray[np.uint8]], *, codec: str = "libx264") -> "Loop":
+    def of(cls, pictures: Sequence[NDArray[np.uint8]]) -> "Loop":
         """Pictures ``[H, W, 3]`` of even sizes, without frames that refer to later ones."""
         height, width = pictures[0].shape[:2]
         container = av.open(io.BytesIO(), "w", format="mpegts")
         options = {"preset": "veryfast", "tune": "zerolatency", "crf": "18"}
-        stream: Any = container.add_stream(codec, rate=30, options=options)
+        stream: Any = container.add_stream("libx264", rate=30, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.codec_context.gop_size = len(pictures)
         packets = []

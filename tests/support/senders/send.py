@@ -13,9 +13,10 @@ import json
 import random
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,8 @@ class SentCamera:
         self._random = random.Random(self.seed)
         self._cut = False
 
-    def send(self, number: int, *, begun: float, now: float) -> None:
-        """Sends picture ``number``, filmed at ``begun + number / fps`` Unix time; ``now`` is after that."""
+    def send(self, number: int, *, begun: float) -> None:
+        """Sends picture ``number``, filmed at ``begun + number / fps`` Unix time."""
         since = number / self.fps
         faults = {trouble.fault for trouble in self.troubles if trouble.start <= since < trouble.start + trouble.length}
         if faults & {Fault.CUT, Fault.SILENT}:
@@ -139,20 +140,20 @@ class SentCamera:
         return True
 
 
-def loops_of(pictures: Sequence[NDArray[np.uint8]], *, codec: str = "libx264") -> dict[str, Loop]:
+def loops_of(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Loop]:
     """What a camera that films ``pictures`` sends, by the trouble it has."""
     return {
-        "": Loop.of(pictures, codec=codec),
-        Fault.STUCK.value: Loop.of(pictures[:1], codec=codec),
-        Fault.SIZE.value: Loop.of([np.ascontiguousarray(picture[::2, ::2]) for picture in pictures], codec=codec),
-        Fault.SHAPE.value: Loop.of([np.ascontiguousarray(picture[:, :-64]) for picture in pictures], codec=codec),
+        "": Loop.of(pictures),
+        Fault.STUCK.value: Loop.of(pictures[:1]),
+        Fault.SIZE.value: Loop.of([np.ascontiguousarray(picture[::2, ::2]) for picture in pictures]),
+        Fault.SHAPE.value: Loop.of([np.ascontiguousarray(picture[:, :-64]) for picture in pictures]),
     }
 
 
 def film(cameras: Sequence[SentCamera], stop: threading.Event, *, seconds: float = float("inf")) -> None:
     """Sends in step until asked to stop."""
     begun_unix, begun = time.time(), time.monotonic()
-    for number in _numbers():
+    for number in count():
         due = number / cameras[0].fps
         if due > seconds:
             return
@@ -160,7 +161,7 @@ def film(cameras: Sequence[SentCamera], stop: threading.Event, *, seconds: float
         for at, index in queue:
             if stop.wait(max(begun + at - time.monotonic(), 0)):
                 return
-            cameras[index].send(number, begun=begun_unix, now=time.time())
+            cameras[index].send(number, begun=begun_unix)
 
 
 def rig_text(urls: Mapping[str, str], calibration: Path, **settings: object) -> str:
@@ -203,13 +204,6 @@ def main() -> None:
     file.write_text(rig_text(urls, bundled_clip_path(), clock=clock, fps=options.fps))
     print(f"{len(cameras)} cameras send; structgstream reconstruct {file} --live -o live.sgs", flush=True)
     film(cameras, threading.Event(), seconds=options.seconds)
-
-
-def _numbers() -> Iterator[int]:
-    number = 0
-    while True:
-        yield number
-        number += 1
 
 
 if __name__ == "__main__":

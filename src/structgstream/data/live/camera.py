@@ -23,7 +23,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from structgstream.data.live.recorder import CameraRecorder
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
-from structgstream.data.live.synchronizer import LivePicture
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
 from structgstream.data.video_index import load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
@@ -104,7 +104,7 @@ class ClockMapper:
     """
 
     def __init__(self, base: TimeBase, *, resets: ClockResets, offset_seconds: float = 0.0) -> None:
-        self._base, self._resets, self._offset = base, resets, offset_seconds
+        self.base, self._resets, self._offset = base, resets, offset_seconds
         self._delay = MinimumDelayFilter()
         self._stamp: float | None = None
         self._seconds = -float("inf")
@@ -114,7 +114,7 @@ class ClockMapper:
     @property
     def shift(self) -> float:
         """What is added to a stamp as it comes, to get the time on the common clock; seconds."""
-        shift = self._delay.value if self._base is TimeBase.ARRIVAL else self._shift
+        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
         return self._wrapped + shift + self._offset
 
     def reconnect(self) -> None:
@@ -143,7 +143,7 @@ class ClockMapper:
         return self._mapped(stamp)
 
     def _first(self, stamp: float, arrived: float, wrap_seconds: float | None) -> PictureTime:
-        if self._base is TimeBase.UNIX and wrap_seconds is not None:
+        if self.base is TimeBase.UNIX and wrap_seconds is not None:
             self._shift = round((arrived - stamp) / wrap_seconds) * wrap_seconds
         self._delay.restart(arrived - stamp, arrived)
         return self._mapped(stamp)
@@ -151,7 +151,7 @@ class ClockMapper:
     def _after_reset(self, stamp: float, delay: float, arrived: float) -> PictureTime:
         """The pictures continue with the delay that they had before the reset."""
         correction = delay - self._delay.value
-        if self._base is not TimeBase.ARRIVAL:
+        if self.base is not TimeBase.ARRIVAL:
             common = self._resets.common(correction)
             self._shift += common
             # The minimum delay of this camera is the one before, by the clock as it is now.
@@ -161,7 +161,7 @@ class ClockMapper:
 
     def _mapped(self, stamp: float) -> PictureTime:
         self._stamp = stamp
-        shift = self._delay.value if self._base is TimeBase.ARRIVAL else self._shift
+        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
         seconds = stamp + shift + self._offset
         if seconds <= self._seconds:
             return PictureTime(None, Fault.REORDERED)
@@ -182,23 +182,17 @@ ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
-class Receiver(Protocol):
-    """Receives a camera's pictures; called from the camera's thread."""
-
-    def deliver(self, camera: str, picture: LivePicture) -> None:
-        """A picture."""
-        ...
-
-    def mark_absent(self, camera: str) -> None:
-        """The camera is disconnected, or sends nothing usable."""
-        ...
-
-    def others_changed_at(self, camera: str) -> float:
-        """When the picture of another camera last changed, monotonic seconds."""
-        ...
-
-
-OpenCamera = Callable[[LiveCamera, float], AbstractContextManager[Any]]
+def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
+    """The opened camera."""
+    options = {**PROBE_OPTIONS, **camera.options}
+    if camera.follow:
+        options["follow"] = "1"
+    if camera.is_session:
+        # Without this FFmpeg opens nothing but files from a file.
+        options.setdefault("protocol_whitelist", "file,udp,rtp")
+    # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
+    timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
+    return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
 
 
 class CameraFeed:
@@ -206,10 +200,11 @@ class CameraFeed:
 
     Args:
         size: width and height of the calibration's pictures.
+        changed_at: by camera, when its picture last changed, monotonic seconds; shared by all feeds.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
         silent_seconds: without packets for this time, the camera is opened again.
         stuck_seconds: a picture that does not change for this time is not used if others change.
-        open_camera: opens a camera with a timeout in seconds; None for PyAV.
+        open_camera: opens a camera with a timeout in seconds.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
         sound: receives the camera's sound; None where that is not wanted.
     """
@@ -220,25 +215,25 @@ class CameraFeed:
         camera: LiveCamera,
         *,
         size: tuple[int, int],
-        receiver: Receiver,
+        synchronizer: FrameSynchronizer,
+        changed_at: dict[str, float],
         clock: ClockMapper,
         faults: FaultLog,
-        base: TimeBase,
         now: Callable[[], float],
         unix_offset: float,
         silent_seconds: float,
         stuck_seconds: float,
         recorder: CameraRecorder | None = None,
-        open_camera: OpenCamera | None = None,
+        open_camera: Callable[[LiveCamera, float], AbstractContextManager[Any]] = open_with_pyav,
         wait: Callable[[float], object] | None = None,
         sound: LiveSound | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
-        self._receiver, self._clock, self._faults, self._base = receiver, clock, faults, base
+        self._synchronizer, self._changed_at = synchronizer, changed_at
+        self._clock, self._faults = clock, faults
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
-        self._recorder, self._sound = recorder, sound
-        self._open_camera = open_with_pyav if open_camera is None else open_camera
+        self._recorder, self._sound, self._open_camera = recorder, sound, open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
         # A daemon, so that a camera that hangs in the system cannot keep the program from ending.
@@ -255,7 +250,6 @@ class CameraFeed:
         self._usable = True
         self.ended = False
         self.decoded = 0
-        self.changed_at = -float("inf")
 
     def start(self) -> None:
         """Begins to read."""
@@ -405,7 +399,7 @@ class CameraFeed:
         self._forget(picture)
         if not self._decodes:
             return
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         text = f"sends what cannot be decoded ({reason}); it is absent until its next key frame"
         self._faults.report(self.name, Fault.GARBAGE, text)
 
@@ -418,7 +412,7 @@ class CameraFeed:
         seconds = self._common_time(frame, arrived, wrap_seconds)
         self._usable = self._has_calibrated_shape(frame)
         if seconds is not None and self._usable and not self._is_frozen(frame, arrived):
-            self._receiver.deliver(self.name, LivePicture(seconds, arrived, frame))
+            self._synchronizer.add(self.name, LivePicture(seconds, arrived, frame))
         return self._clock.shift
 
     def _pace(self, frame: "VideoFrame") -> None:
@@ -453,7 +447,7 @@ class CameraFeed:
         """The stamp to use for a picture without one; None if the picture must not be used."""
         self._faults.count(self.name, Fault.NO_STAMP)
         self._unstamped += 1
-        if self._base is not TimeBase.ARRIVAL:
+        if self._clock.base is not TimeBase.ARRIVAL:
             text = 'sends pictures without time stamps; take clock = "arrival" for this rig if all are'
             self._faults.warn(self.name, Fault.NO_STAMP.value, text)
             return None
@@ -470,25 +464,27 @@ class CameraFeed:
         text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
         self._faults.report(self.name, Fault.OTHER_SIZE, text)
         if not alike:
-            self._receiver.mark_absent(self.name)
+            self._synchronizer.mark_absent(self.name)
         return alike
 
     def _is_frozen(self, frame: "VideoFrame", arrived: float) -> bool:
         """Whether the picture has not changed for a long time while those of other cameras did."""
         checksum = picture_checksum(frame)
         if checksum != self._checksum:
-            self._checksum, self.changed_at = checksum, arrived
+            self._checksum, self._changed_at[self.name] = checksum, arrived
             return False
-        if self._receiver.others_changed_at(self.name) - self.changed_at < self._stuck:
+        changed_at = self._changed_at[self.name]
+        others = (seconds for name, seconds in self._changed_at.items() if name != self.name)
+        if max(others, default=changed_at) - changed_at < self._stuck:
             return False
-        text = f"has sent the same picture for {arrived - self.changed_at:.1f} s; it is absent until that changes"
+        text = f"has sent the same picture for {arrived - changed_at:.1f} s; it is absent until that changes"
         self._faults.report(self.name, Fault.STUCK, text)
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         return True
 
     def _report_end(self, reason: str) -> None:
         """A file was read to its end, or cannot be read."""
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         if self.decoded:
             how = "" if reason is ENDED else f" ({reason})"
             text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"
@@ -503,7 +499,7 @@ class CameraFeed:
     def _report_gone(self, reason: str) -> None:
         if self._gone_since is None:
             self._gone_since = self._now()
-        self._receiver.mark_absent(self.name)
+        self._synchronizer.mark_absent(self.name)
         text = f"at {self._camera.shown_url} is gone ({reason}); it is absent, and is opened again until it is back"
         self._faults.report(self.name, Fault.GONE, text)
 
@@ -511,19 +507,6 @@ class CameraFeed:
         if self._gone_since is not None:
             self._faults.warn(self.name, "back", f"is back after {arrived - self._gone_since:.1f} s")
             self._gone_since = None
-
-
-def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
-    """The opened camera."""
-    options = {**PROBE_OPTIONS, **camera.options}
-    if camera.follow:
-        options["follow"] = "1"
-    if camera.is_session:
-        # Without this FFmpeg opens nothing but files from a file.
-        options.setdefault("protocol_whitelist", "file,udp,rtp")
-    # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
-    timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
-    return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
 
 
 def _is_of(packet: "Packet", picture: "VideoFrame") -> bool:

@@ -3,69 +3,27 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
 
-from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets, OpenCamera
+from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
-from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
-from structgstream.frames import MultiViewFrame
+from structgstream.data.live.synchronizer import FrameSynchronizer, PictureSet
 
 TICK_SECONDS = 0.02
 MAX_MISSED_SETS = 30  # before a camera is reported as out of step
 JOIN_SECONDS = 1.0
 
 
-class FrameBuffer:
-    """Holds the newest set of pictures until it is taken; a newer one replaces it. Thread-safe.
-
-    ``convert`` makes the frame of a set: sRGB pictures, and the presentation time on the common clock.
-    """
-
-    def __init__(self, convert: Callable[[PictureSet], MultiViewFrame]) -> None:
-        self._convert = convert
-        self._newest: PictureSet | None = None
-        self._changed = threading.Condition()
-        self.skipped = 0
-        """Number of sets that were replaced by a newer one."""
-        self.times: tuple[float, float] | None = None
-        """When the last picture of the set that was taken last arrived, and when it was complete; monotonic seconds."""
-
-    def put(self, pictures: PictureSet) -> None:
-        """Stores a set."""
-        with self._changed:
-            self.skipped += self._newest is not None
-            self._newest = pictures
-            self._changed.notify()
-
-    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
-        """The next frame; None if there was none in time."""
-        with self._changed:
-            if self._newest is None:
-                self._changed.wait(timeout_seconds)
-            pictures, self._newest = self._newest, None
-        if pictures is None:
-            return None
-        self.times = pictures.arrived, pictures.matched
-        return self._convert(pictures)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no set waits."""
-        return self._newest is None
-
-
 class Ingest:
-    """Cameras' pictures on their way to a buffer, as complete sets.
+    """Cameras' pictures as complete sets, of which the newest waits until it is taken.
 
     Args:
         sizes: width and height of each camera's pictures as they were calibrated, pixels.
         fps: maximum number of sets per second.
         now: monotonic seconds.
         unix_offset: Unix time minus ``now``, seconds.
-        open_camera: opens a camera with a timeout; None for PyAV.
         sound: receives the sound of the camera that it names; None for none.
     """
 
@@ -76,14 +34,12 @@ class Ingest:
         sizes: Mapping[str, tuple[int, int]],
         fps: float,
         faults: FaultLog,
-        buffer: FrameBuffer,
         recording: Recording | None,
         now: Callable[[], float],
         unix_offset: float,
-        open_camera: OpenCamera | None = None,
         sound: LiveSound | None = None,
     ) -> None:
-        self._rig, self._faults, self.buffer, self._now = rig, faults, buffer, now
+        self._rig, self._faults, self._now = rig, faults, now
         self._synchronizer = FrameSynchronizer(
             sizes,
             fps=fps,
@@ -93,26 +49,28 @@ class Ingest:
             count=faults.count,
             started=now(),
         )
-        self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._last_arrival = now()
         self._failure: BaseException | None = None
+        self._newest: PictureSet | None = None
+        self._complete = threading.Condition()
         self.sets = 0
-        self.small_sets = 0  # with pictures of too few training cameras for a frame
-        resets = ClockResets()
-        common: dict[str, Any] = {
-            "receiver": self, "faults": faults, "base": rig.clock, "now": now, "unix_offset": unix_offset,
-            "silent_seconds": rig.silent_seconds, "stuck_seconds": rig.stuck_seconds, "open_camera": open_camera,
-        }  # fmt: skip
+        self.skipped_sets = 0  # replaced by a newer one before they were taken
+        resets, changed_at = ClockResets(), dict.fromkeys(rig.cameras, -float("inf"))
         self.feeds = {
             name: CameraFeed(
                 name,
                 camera,
                 size=sizes[name],
+                synchronizer=self._synchronizer,
+                changed_at=changed_at,
                 clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
+                faults=faults,
+                now=now,
+                unix_offset=unix_offset,
+                silent_seconds=rig.silent_seconds,
+                stuck_seconds=rig.stuck_seconds,
                 recorder=None if recording is None else recording.camera(name, faults),
                 sound=sound if sound is not None and sound.name == name else None,
-                **common,
             )
             for name, camera in rig.cameras.items()
         }
@@ -132,34 +90,23 @@ class Ingest:
         for thread in (self._thread, *self.feeds.values()):
             thread.join(JOIN_SECONDS)
 
-    def deliver(self, camera: str, picture: LivePicture) -> None:
-        """See ``camera.Receiver``."""
-        with self._changed:
-            self._synchronizer.add(camera, picture)
-            self._last_arrival = picture.arrived
-            self._changed.notify()
-
-    def mark_absent(self, camera: str) -> None:
-        """See ``camera.Receiver``."""
-        with self._changed:
-            self._synchronizer.mark_absent(camera)
-            self._changed.notify()
-
-    def others_changed_at(self, camera: str) -> float:
-        """See ``camera.Receiver``."""
-        return max((feed.changed_at for name, feed in self.feeds.items() if name != camera), default=-float("inf"))
+    def take(self, timeout_seconds: float) -> PictureSet | None:
+        """The newest set that was not taken yet; None if there was none in time."""
+        with self._complete:
+            if self._newest is None:
+                self._complete.wait(timeout_seconds)
+            pictures, self._newest = self._newest, None
+        return pictures
 
     @property
     def queue_lengths(self) -> dict[str, int]:
         """Number of pictures that wait to be matched, by camera."""
-        with self._changed:
-            return self._synchronizer.queue_lengths
+        return self._synchronizer.queue_lengths
 
     @property
     def present(self) -> list[str]:
         """Cameras that send usable pictures, the next of which is not later than the deadline."""
-        with self._changed:
-            return self._synchronizer.present(self._now())
+        return self._synchronizer.present(self._now())
 
     @property
     def open_cameras(self) -> list[str]:
@@ -175,11 +122,11 @@ class Ingest:
         """
         if self._failure is not None:
             raise self._failure
-        if not self.buffer.is_empty:
+        if self._newest is not None:
             return None
         if not self.open_cameras and not any(self.queue_lengths.values()):
             return "all files of cameras have come to their end, or cannot be read"
-        limit, silent = self._rig.end_seconds, self._now() - self._last_arrival
+        limit, silent = self._rig.end_seconds, self._now() - self._synchronizer.last_arrived
         if limit is not None and silent > limit:
             return f"no camera has sent a picture for {silent:.0f} s, so the stream ends (end_seconds in the rig file)"
         return None
@@ -193,14 +140,17 @@ class Ingest:
     def _synchronize(self) -> None:
         try:
             while not self._stop.is_set():
-                with self._changed:
+                with self._synchronizer.changed:
                     pictures = self._synchronizer.next_set(self._now())
                     if pictures is None:
-                        self._changed.wait(TICK_SECONDS)
+                        self._synchronizer.changed.wait(TICK_SECONDS)
                         continue
                     out_of_step = self._synchronizer.out_of_step(MAX_MISSED_SETS)
-                self.sets += 1
-                self.buffer.put(pictures)
+                with self._complete:
+                    self.sets += 1
+                    self.skipped_sets += self._newest is not None
+                    self._newest = pictures
+                    self._complete.notify()
                 self._warn_out_of_step(out_of_step)
         except BaseException as error:  # raised in the trainer's thread
             self._failure = error

@@ -87,7 +87,7 @@ class ResumeCache:
         """The stored frames from index ``start`` on, without a gap; none if ``start`` is the next live frame."""
         index = start
         while self._path(index).is_file():
-            yield self._read(index)[0]
+            yield read_pictures(self._path(index))[0]
             index += 1
         if index == start and start > 0 and not self._path(start - 1).is_file():
             raise CaptureError(
@@ -100,14 +100,8 @@ class ResumeCache:
         files = self._files()
         if not files:
             return None
-        frame, origin = self._read(max(files))
+        frame, origin = read_pictures(files[max(files)])
         return frame.pts_seconds, origin
-
-    def _read(self, index: int) -> tuple[MultiViewFrame, float]:
-        try:
-            return read_pictures(self._path(index))
-        except CaptureError as error:
-            raise CaptureError(f"{error} Without them the stream cannot be resumed; begin another one.") from None
 
     def _path(self, index: int) -> Path:
         return self._folder / f"frame-{index:08d}.pictures"
@@ -151,10 +145,10 @@ def read_pictures(path: Path) -> tuple[MultiViewFrame, float]:
             masks = {name: _read(file, entry, np.bool_, ()) for name, entry in header["masks"].items()}
         times = float(header["pts_seconds"]), header["captured_unix_seconds"]
         return MultiViewFrame(int(header["index"]), times[0], images, masks, times[1]), float(header["origin_seconds"])
-    except FileNotFoundError:
-        raise CaptureError(f"The pictures {path} are missing.") from None
     except (OSError, ValueError, KeyError, TypeError, zstandard.ZstdError) as error:
-        raise CaptureError(f"The pictures {path} are damaged ({error}).") from None
+        raise CaptureError(
+            f"The pictures {path} are damaged ({error}). Without them the stream cannot be resumed; begin another one."
+        ) from None
 
 
 def residuals(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

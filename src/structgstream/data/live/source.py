@@ -4,11 +4,10 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import CameraRig
 from structgstream.data.denoising import DenoisingConfig, mean_of_still
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.live.ingest import FrameBuffer, Ingest
+from structgstream.data.live.ingest import Ingest
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
@@ -74,27 +73,6 @@ def read_calibration(folder: Path) -> PreparedCapture:
     return PreparedCapture(cameras, source.fps, near, "arbitrary", rig.held_out)
 
 
-def filmed_sizes(capture: PreparedCapture) -> dict[str, tuple[int, int]]:
-    """Width and height of each camera's pictures before undistortion, pixels."""
-    return {name: (own.filmed.camera.width, own.filmed.camera.height) for name, own in capture.cameras.items()}
-
-
-def with_calibration(
-    pictures: FrameSource,
-    capture: PreparedCapture,
-    folder: Path,
-    *,
-    held_out: tuple[str, ...] | None,
-    scale: float,
-    near: float | None,
-    without: tuple[str, ...] = (),
-) -> FrameSource:
-    """Live ``pictures`` of ``prepared.filmed_rig``, undistorted and masked as those of a prepared capture in ``folder``
-    are, which has cameras that ``capture`` is ``without``; other arguments as of ``open_capture``."""
-    source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER, without=without)
-    return selected(source, held_out=held_out, scale=scale, near=near)
-
-
 log = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.2
@@ -122,8 +100,6 @@ class LiveSource:
 
     Args:
         stream: the stream to write, next to which the resume cache lies (:class:`ResumeCache`).
-        now: monotonic seconds.
-        unix: Unix time, asked once.
 
     Raises:
         CaptureError: the rig file or the calibration is broken; while reading, a frame of the past is not cached.
@@ -131,16 +107,7 @@ class LiveSource:
         StorageError: a folder cannot be used, or pictures cannot be written.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        stream: Path,
-        options: LiveOptions | None = None,
-        *,
-        now: Callable[[], float] = time.monotonic,
-        unix: Callable[[], float] = time.time,
-    ) -> None:
-        options = LiveOptions() if options is None else options
+    def __init__(self, path: Path, stream: Path, options: LiveOptions = LiveOptions()) -> None:
         rig = read_rig(path)
         calibration = read_calibration(rig.calibration)
         check_cameras(rig, list(calibration.cameras), path)
@@ -151,18 +118,22 @@ class LiveSource:
             )
         self.sound = None if options.sound is None else LiveSound(options.sound)
         self._live: LiveRig = rig
-        self._options, self._now = options, now
-        self._unix_offset = unix() - now()
+        self._options = options
+        self._unix_offset = time.time() - time.monotonic()
         self.name = rig.name
         self.fps = calibration.fps if rig.fps is None else rig.fps
         self._filmed = filmed_rig(rig.calibration, self._calibration)
+        self._sizes = {name: (camera.width, camera.height) for name, camera in self._filmed.cameras.items()}
+        self._reformatter = load_av().video.reformatter.VideoReformatter()
         self.rig: CameraRig = self._calibrated(iter(())).rig
         self.points: NDArray[np.float64] | None = None
-        self.faults = FaultLog(self.name, now=now)
+        self.faults = FaultLog(self.name, now=time.monotonic)
         self._cache = ResumeCache(resume_folder(stream), cameras=self.rig.training, resume=options.resume)
         self._stopped = threading.Event()
         self._ingest: Ingest | None = None
-        self._ages: dict[str, float | None] = {}
+        self._small_sets = 0
+        self._times = 0.0, 0.0  # of the last set: when its last picture arrived, and when it was complete
+        self._ages: dict[str, float] = {}
         self._captured: dict[int, float] = {}
 
     def retain(self, *first: int, last: int) -> None:
@@ -197,7 +168,7 @@ class LiveSource:
         """State of cameras and synchronisation."""
         faults, ingest = self.faults.counts, self._ingest
         if ingest is None:  # cameras have not been opened yet
-            return LiveStatus({name: CameraStatus(faults=faults.get(name, {})) for name in self._live.cameras})
+            return LiveStatus({name: CameraStatus() for name in self._live.cameras})
         present, lengths = ingest.present, ingest.queue_lengths
         return LiveStatus(
             {
@@ -205,17 +176,15 @@ class LiveSource:
                 for name, feed in ingest.feeds.items()
             },
             sets=ingest.sets,
-            small_sets=ingest.small_sets,
-            skipped_sets=ingest.buffer.skipped,
+            small_sets=self._small_sets,
+            skipped_sets=ingest.skipped_sets,
             **self._ages,
         )
 
     def __enter__(self) -> "LiveSource":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.stop()
 
     def _live_frames(self, start: int) -> Iterator[MultiViewFrame]:
@@ -224,7 +193,7 @@ class LiveSource:
         with self._running() as (ingest, recording):
             frames = self._calibrated(self._arriving(ingest, is_first=start == 0)).frames()
             for index, frame in enumerate(frames, start):
-                times, seconds = ingest.buffer.times, frame.pts_seconds
+                times, seconds = self._times, frame.pts_seconds
                 origin = self._origin(origin, seconds, pts)
                 pts = seconds - origin
                 if self.sound is not None:
@@ -242,14 +211,12 @@ class LiveSource:
 
     def _denoised(self, frame: MultiViewFrame, ingest: Ingest) -> MultiViewFrame:
         """Frame 0, averaged with the sets after it (``data/denoising.py``)."""
-        config, deadline = self._options.denoising, self._now() + MAX_DENOISING_SECONDS
+        config, deadline = self._options.denoising, time.monotonic() + MAX_DENOISING_SECONDS
 
         def following() -> Iterator[MultiViewFrame]:
-            count = 0
-            while count < config.frames - 1 and not self.stopped and self._now() < deadline:
+            while not self.stopped and time.monotonic() < deadline:
                 ended = ingest.end_reason
-                if (found := ingest.buffer.take(POLL_SECONDS)) is not None:
-                    count += 1
+                if (found := self._taken(ingest)) is not None:
                     yield found
                 elif ended:
                     return
@@ -272,39 +239,33 @@ class LiveSource:
             return seconds - before - 1 / self.fps
         return origin
 
-    def _measure_delivery(self, frame: MultiViewFrame, times: tuple[float, float] | None) -> None:
-        now = self._now()
-        if frame.captured_unix_seconds is not None:
-            captured = frame.captured_unix_seconds - self._unix_offset
-            self._ages = {
-                "arrived_seconds": None if times is None else times[0] - captured,
-                "matched_seconds": None if times is None else times[1] - captured,
-                "delay_seconds": now - captured,
-            }
-            self._captured[frame.index] = frame.captured_unix_seconds
-            self._captured.pop(frame.index - MAX_CAPTURE_TIMES, None)
+    def _measure_delivery(self, frame: MultiViewFrame, times: tuple[float, float]) -> None:
+        assert frame.captured_unix_seconds is not None
+        captured = frame.captured_unix_seconds - self._unix_offset
+        self._ages = {
+            "arrived_seconds": times[0] - captured,
+            "matched_seconds": times[1] - captured,
+            "delay_seconds": time.monotonic() - captured,
+        }
+        self._captured[frame.index] = frame.captured_unix_seconds
+        self._captured.pop(frame.index - MAX_CAPTURE_TIMES, None)
 
     def _calibrated(self, arriving: Iterator[MultiViewFrame]) -> FrameSource:
-        options = self._options
-        return with_calibration(
-            LivePictures(self.name, self._filmed, self.fps, arriving),
-            self._calibration,
-            self._live.calibration,
-            held_out=options.held_out,
-            scale=options.scale,
-            near=options.near,
-            without=self._live.without,
-        )
+        """Pictures as they arrive, undistorted and masked as those of the calibration's capture are."""
+        options, folder = self._options, self._live.calibration
+        pictures = undistorted(LivePictures(self.name, self._filmed, self.fps, arriving), folder, self._calibration)
+        source = with_masks(pictures, folder / FOLDER, without=self._live.without)
+        return selected(source, held_out=options.held_out, scale=options.scale, near=options.near)
 
     def _arriving(self, ingest: Ingest, *, is_first: bool) -> Iterator[MultiViewFrame]:
         """Frames before undistortion, at times of the common clock; frame 0 (``is_first``) waits for all cameras."""
-        started = reported = self._now()
+        started = reported = time.monotonic()
         interval = HEARTBEAT_SECONDS
         while not self.stopped:
             # Asked before the frame, so that a set that arrives in between is not lost.
             ended, sending = ingest.end_reason, ingest.open_cameras
-            frame = ingest.buffer.take(POLL_SECONDS)
-            now = self._now()
+            frame = self._taken(ingest)
+            now = time.monotonic()
             if frame is None:
                 if ended and is_first:
                     raise CaptureError(
@@ -323,7 +284,7 @@ class LiveSource:
             if is_first and now - started < self._live.start_seconds and {*absent} & {*sending}:
                 continue
             if len(frame.showing(self.rig.training)) < MIN_CAMERAS:
-                ingest.small_sets += 1
+                self._small_sets += 1
                 continue
             if is_first and absent:
                 missing = ", ".join(absent)
@@ -339,12 +300,11 @@ class LiveSource:
             recording = Recording(self._options.record, self._calibration, fps=self.fps, masks=masks)
         ingest = self._ingest = Ingest(
             self._live,
-            sizes=filmed_sizes(self._calibration),
+            sizes=self._sizes,
             fps=self.fps,
             faults=self.faults,
-            buffer=FrameBuffer(self._converter()),
             recording=recording,
-            now=self._now,
+            now=time.monotonic,
             unix_offset=self._unix_offset,
             sound=self.sound,
         )
@@ -356,22 +316,25 @@ class LiveSource:
             if recording is not None:
                 recording.close()
 
-    def _converter(self) -> Callable[[PictureSet], MultiViewFrame]:
-        """Makes a frame of a set; a camera whose colours cannot be converted is absent from it."""
-        reformatter = load_av().video.reformatter.VideoReformatter()
-        sizes: Mapping[str, tuple[int, int]] = filmed_sizes(self._calibration)
+    def _taken(self, ingest: Ingest) -> MultiViewFrame | None:
+        """The frame of the newest set; None if there was none for a moment."""
+        found = ingest.take(POLL_SECONDS)
+        if found is None:
+            return None
+        self._times = found.arrived, found.matched
+        return self._converted(found)
 
-        def convert(found: PictureSet) -> MultiViewFrame:
-            images = {}
-            for name, picture in found.pictures.items():
-                try:
-                    images[name] = srgb(picture.content, reformatter, width=sizes[name][0], height=sizes[name][1])
-                except (load_av().error.FFmpegError, ValueError) as error:
-                    text = f"sends pictures whose colours cannot be converted ({error}); it is absent"
-                    self.faults.report(name, Fault.GARBAGE, text)
-            first = min(found.pictures.values(), key=lambda picture: picture.arrived)
-            is_relative = self._live.clock is TimeBase.STREAM  # the cameras' clock need not be Unix time
-            captured = first.arrived + self._unix_offset if is_relative else found.seconds
-            return MultiViewFrame(0, found.seconds, images, captured_unix_seconds=captured)
-
-        return convert
+    def _converted(self, found: PictureSet) -> MultiViewFrame:
+        """The sRGB pictures of a set, at its time; a camera whose colours cannot be converted is absent."""
+        images = {}
+        for name, picture in found.pictures.items():
+            width, height = self._sizes[name]
+            try:
+                images[name] = srgb(picture.content, self._reformatter, width=width, height=height)
+            except (load_av().error.FFmpegError, ValueError) as error:
+                text = f"sends pictures whose colours cannot be converted ({error}); it is absent"
+                self.faults.report(name, Fault.GARBAGE, text)
+        first = min(found.pictures.values(), key=lambda picture: picture.arrived)
+        is_relative = self._live.clock is TimeBase.STREAM  # the cameras' clock need not be Unix time
+        captured = first.arrived + self._unix_offset if is_relative else found.seconds
+        return MultiViewFrame(0, found.seconds, images, captured_unix_seconds=captured)

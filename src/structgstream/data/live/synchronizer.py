@@ -12,6 +12,7 @@ Instants increase, except where a camera whose clock is ahead led before the oth
 the last instant by more than :data:`MAX_LATE_SECONDS` are not late, and lead again.
 """
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -57,7 +58,7 @@ class _Queue:
 
 
 class FrameSynchronizer:
-    """Pictures in, sets out (Note [Picture sets]). It has no clock and no thread; callers lock it.
+    """Pictures in, sets out (Note [Picture sets]). It has no clock and no thread. Cameras' threads add pictures.
 
     Args:
         cameras: names, in the rig's order.
@@ -66,6 +67,10 @@ class FrameSynchronizer:
         deadline_seconds: how long a set waits for its pictures.
         queue_frames: maximum number of waiting pictures of a camera; the oldest are dropped.
         started: when the cameras were opened; they count as present as if they had sent a picture then.
+
+    Attributes:
+        changed: the lock, which is notified when another set may be complete.
+        last_arrived: when the last picture arrived, monotonic seconds.
     """
 
     def __init__(
@@ -85,19 +90,25 @@ class FrameSynchronizer:
         self._present = deadline_seconds + 1 / fps  # from one picture to the next at most
         self._max_queue, self._count = queue_frames, count
         self._last = -float("inf")
+        self.changed = threading.Condition()
+        self.last_arrived = started
 
     def add(self, camera: str, picture: LivePicture) -> None:
         """Adds a picture, whose time is after the camera's last one."""
         queue = self._queues[camera]
-        queue.last_arrived = picture.arrived
-        queue.pictures.append(picture)
-        if len(queue.pictures) > self._max_queue:
-            queue.pictures.popleft()
-            self._count(camera, Fault.OVERFLOW)
+        with self.changed:
+            queue.last_arrived = self.last_arrived = picture.arrived
+            queue.pictures.append(picture)
+            if len(queue.pictures) > self._max_queue:
+                queue.pictures.popleft()
+                self._count(camera, Fault.OVERFLOW)
+            self.changed.notify()
 
     def mark_absent(self, camera: str) -> None:
         """Sets do not wait for the camera until it sends again."""
-        self._queues[camera].last_arrived = -float("inf")
+        with self.changed:
+            self._queues[camera].last_arrived = -float("inf")
+            self.changed.notify()
 
     def present(self, now: float) -> list[str]:
         """The cameras whose next picture is not later than the deadline, in the rig's order."""
@@ -114,7 +125,7 @@ class FrameSynchronizer:
         return {name: len(queue.pictures) for name, queue in self._queues.items()}
 
     def next_set(self, now: float) -> PictureSet | None:
-        """The next set that is complete at ``now``; None if none is."""
+        """The next set that is complete at ``now``; None if none is. The caller, the only one, holds the lock."""
         present = self.present(now)
         reference = self._reference(present)
         if reference is None:
