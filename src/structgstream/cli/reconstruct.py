@@ -31,7 +31,7 @@ from structgstream.cli.options import (
 from structgstream.cli.progress import human_bytes, print_lines
 
 if TYPE_CHECKING:
-    from structgstream.cli.options import Captured
+    from structgstream.codec.segments.sink import Clocks
     from structgstream.data.sound import SoundSource
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
@@ -133,7 +133,9 @@ def main(arguments: list[str]) -> None:
     may_exist = options.resume or options.overwrite
     options.segments.chosen(options.output)
     opened = open_scene(options, config, preset=preset, console=console)
-    with options.segments.storage(options.output, may_exist=may_exist, report=partial(print_lines, console)) as storage:
+    with options.segments.storage(
+        options.output, may_exist=may_exist, report=partial(print_lines, console), clocks=opened.clocks
+    ) as storage:
         peaks = run_reconstruction(
             opened.source,
             config,
@@ -142,7 +144,7 @@ def main(arguments: list[str]) -> None:
             metadata=opened.metadata,
             sound=opened.sound,
             resume=options.resume,
-            storage=None if storage is None else storage(opened.captured),
+            storage=storage,
             metrics=run_metrics(opened.source, options.output),
         )
         if peaks:
@@ -156,7 +158,7 @@ class OpenedScene:
     """What a run reads, and with what it computes."""
 
     source: "FrameStream"  # a recording, or live cameras
-    captured: "Captured | None"  # when a frame was filmed, Unix time, by its number; None for a recording
+    clocks: "Clocks | None"  # with the times at which live cameras filmed; None for a recording
     backend: "Backend"
     metadata: Mapping[str, object]  # of the run, for headers
     sound: "SoundSource | None"  # to store beside the frames
@@ -164,6 +166,7 @@ class OpenedScene:
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
+    from structgstream.codec.segments.sink import Clocks
     from structgstream.data.camera_spacing import expectation
     from structgstream.data.roving import roving_of
     from structgstream.evaluation.recording import part_metadata
@@ -182,11 +185,11 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
             denoising=config.denoising,
             sound=options.sound,
         )
-        length, captured, sound = "live", source.captured, source.sound
+        length, clocks, sound = "live", Clocks(captured=source.captured), source.sound
     else:
         options.live.check(options.scene)
         source = open_selected_capture(options.scene, options.capture)
-        length, captured = f"{len(source)} frames", None
+        length, clocks = f"{len(source)} frames", None
         if (roving := roving_of(source)) is not None:
             length = f"{length}; {len(roving.pictures)} roving pictures for frame 0"
         sound = chosen_sound(source, options.scene, options.sound, offset_seconds=options.sound_offset)
@@ -207,7 +210,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     metadata = {"preset": preset, **part}
     if sound is not None:
         print_lines(console, f"Sound: {sound.name}.")
-    return OpenedScene(source, captured, backend, metadata, sound)
+    return OpenedScene(source, clocks, backend, metadata, sound)
 
 
 def run_reconstruction(
@@ -328,8 +331,8 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
             configured(config, quality)
     console, names = Console(), [quality.name for quality in qualities]
     opened = open_scene(options, config, preset=preset, console=console)
-    folders = options.segments.quality_folders(
-        options.output, names, resume=options.resume, overwrite=options.overwrite
+    storages = options.segments.quality_folders(
+        options.output, names, resume=options.resume, overwrite=options.overwrite, clocks=opened.clocks
     )
     metrics = run_metrics(opened.source, options.output, qualities=names)
 
@@ -340,7 +343,7 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
             config,
             qualities,
             opened.backend,
-            storages={name: storage(opened.captured) for name, storage in folders.items()},
+            storages=storages,
             resume=options.resume,
             metadata=opened.metadata,
             on_step=on_step,
