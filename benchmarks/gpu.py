@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.stages import mapped
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.cameras import Camera, Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend
 from structgstream.kernels.values import FitFrame, Rasterizer, RasterOutput
-from structgstream.scene.render import render
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.session.presets import COMPACT
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
@@ -59,13 +60,7 @@ PREDICTED: Mapping[str, str] = {
 
 def moved(value: Any, device: torch.device) -> Any:
     """``value`` with copies of its tensors on ``device``."""
-    if isinstance(value, Tensor):
-        return value.detach().to(device, copy=True)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value) if f.init})
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(moved(part, device) for part in value))
-    return [moved(part, device) for part in value] if isinstance(value, list) else value
+    return mapped(value, lambda tensor: tensor.detach().to(device, copy=True))
 
 
 def copied(frame: FitFrame, device: torch.device) -> FitFrame:
@@ -276,10 +271,8 @@ class Measurement:
             scene, cameras = moved(world.before, self.backend.device), list(world.rig.cameras.values())
 
             def draw(scene: Any = scene, cameras: Sequence[Any] = cameras) -> None:
-                with torch.no_grad():
-                    for camera in cameras:
-                        image = render(scene, camera, self.backend).image
-                        (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
+                for camera in cameras:
+                    to_8bit_image(render(scene, camera, self.backend).image)
 
             draw()
             found[title] = {"pictures a second": len(cameras) / self.seconds(draw)}
