@@ -22,6 +22,12 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import fit_next_frame
+from structgstream.training.online.preprocess import preprocess
+from structgstream.training.result import FitResult
+from structgstream.training.views import training_views
 
 WALL_WIDTH, WALL_HEIGHT = 2.8, 2.1
 DISTANCE = 2.4
@@ -148,6 +154,20 @@ def wall_world(
         return MultiViewFrame(index, index / 30.0, images)
 
     return World(rig, before, taken(before, 0), taken(after, 1))
+
+
+def fitted(world: World, backend: Backend, config: OnlineConfig) -> FitResult:
+    """Frame 1 fitted from the true scene of frame 0; its pictures are prepared by the caller's thread."""
+    pictures = preprocess(
+        world.frame,
+        world.rig,
+        before=training_views(world.previous, world.rig, backend.device),
+        motion=config.motion,
+        scene_flow=config.scene_flow,
+        backend=backend,
+    )
+    scene = on_device(world.before, backend.device)
+    return fit_next_frame(scene, world.frame, world.rig, config=config, backend=backend, seed=0, pictures=pictures)
 
 
 def held_out_psnr(scene: Scene, world: World, backend: Backend) -> float:
