@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli import main, serve
-from structgstream.serve.access import EVERY_STREAM, Access, read_keys
+from structgstream.serve.access import Access, read_keys
 from tests.support.quick_streams import error_of
 
 NOW = 1.7e9
@@ -37,13 +37,6 @@ def test_a_token_holds_for_its_hours(secret: Path, capsys: pytest.CaptureFixture
     made = printed(secret, capsys, "studio")
     assert keys.access(made, "studio", unix_seconds=NOW + 7199) is Access.GRANTED
     assert keys.access(made, "studio", unix_seconds=NOW + 7200) is Access.EXPIRED
-
-
-def test_one_for_every_stream(secret: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = printed(secret, capsys, "--every")
-    assert {read_keys(secret).access(made, name, unix_seconds=NOW) for name in ("a", "b", EVERY_STREAM)} == {
-        Access.GRANTED
-    }
 
 
 @pytest.mark.parametrize("address", ["https://x.example", "https://x.example/", "https://x.example//"])
