@@ -2,20 +2,20 @@
 """``structgstream reconstruct``, also into several qualities."""
 
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Termination, UsageError, interruption, usage_errors
-from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of, stop_on_interrupt
+from structgstream.cli.app import StopSignal, UsageError, interruption, usage_errors
+from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -270,7 +270,7 @@ def _follow(
     from structgstream.data.source import frame_count
 
     done, stored, read = start(lambda step: progress.step(step))  # progress needs the number of existing frames
-    total, pressed, peaks = frame_count(source), Event(), dict[str, int]()
+    total, peaks, pressed = frame_count(source), dict[str, int](), StopSignal(number=signal.SIGINT)
 
     def message() -> str:
         if not done and not in_qualities:
@@ -280,9 +280,9 @@ def _follow(
 
     with (
         interruption(message),
-        Termination(on_ask=stop_of(source)) as ending,
+        StopSignal(stop_of(source)) as ending,
         monitored(source, metrics, done=done) as progress,
-        stop_on_interrupt(pressed.is_set, pressed.set) if in_qualities and total is not None else nullcontext(),
+        pressed if in_qualities and total is not None else nullcontext(),
         closing(stored) as reports,
     ):
         for report, quality, whole in map(read, reports):
@@ -293,8 +293,7 @@ def _follow(
             if whole:
                 done = report.index + 1
                 ending.end(whole=done == total)
-                if pressed.is_set() and done != total:
-                    raise KeyboardInterrupt
+                pressed.end(whole=done == total)
         ending.end(whole=done == total)  # Live cameras had nothing to give any more.
         if not done:
             raise KeyboardInterrupt  # They were stopped before frame 0.
