@@ -11,6 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from structgstream.cli.app import UsageError
 from structgstream.cli.options import (
     Device,
     Folder,
@@ -79,6 +80,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
+    if not reader.packets:
+        raise UsageError("the stream has no whole frame, so there is nothing to score.")
     source, stored = captures_of(reader.header, options.scene, frames=len(reader.packets))
     report = run_evaluation(
         reader,
@@ -118,7 +121,7 @@ def run_evaluation(
     from structgstream.evaluation.worst import WorstPictures, write_page
 
     frames = len(reader.packets)
-    wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()
+    wanted = set(spread_indices(frames, SHEET_COLUMNS))
     compared_pictures: dict[str, dict] = {}
     worst = WorstPictures()
     console = Console(stderr=True)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``, also into several qualities."""
 
+import argparse
 import shutil
 import signal
 import sys
@@ -301,14 +302,12 @@ def _follow(
 
 
 def _print_config(arguments: list[str]) -> None:
-    preset = None
-    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
-        if argument == "--preset":
-            if following is None:
-                raise UsageError("--preset needs a name after it, such as --preset fast.")
-            preset = following
-        elif argument.startswith("--preset="):
-            preset = argument.removeprefix("--preset=")
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset")
+    try:
+        preset = parser.parse_known_args(arguments)[0].preset
+    except argparse.ArgumentError:
+        raise UsageError("--preset needs a name after it, such as --preset fast.") from None
     config, name = resolve_config(preset, [], command="reconstruct", seed=None)
     print(f"Each field of the configuration is an option of reconstruct; values are those of the preset {name!r}.\n")
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
