@@ -5,12 +5,12 @@ import argparse
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -36,15 +36,10 @@ if TYPE_CHECKING:
     from structgstream.data.sound import SoundSource
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
-    from structgstream.recorder import RunMetrics, Storage
+    from structgstream.recorder import Run, RunMetrics, Storage
     from structgstream.scene.scene import Scene
-    from structgstream.session.frame_report import FrameReport
     from structgstream.session.presets import StreamConfig
     from structgstream.training.result import StepListener
-
-    Started = tuple[int, Generator[Any, None, None], Callable[[Any], tuple[FrameReport, str | None, bool]]]
-    """Number of existing frames, reports of the others, and what a report states: frame, quality, and whether all
-    qualities have it."""
 
 
 @dataclass(frozen=True)
@@ -238,8 +233,8 @@ def run_reconstruction(
     from structgstream.recorder import record
     from structgstream.session.struct_gstream import stream_pipeline
 
-    def start(on_step: "StepListener") -> "Started":
-        run = record(
+    def start(on_step: "StepListener") -> "Run":
+        return record(
             output,
             source,
             stream_pipeline(config),
@@ -251,13 +246,12 @@ def run_reconstruction(
             remarks=None if metrics is None else metrics.frame,
             sound=sound,
         )
-        return run.done, run.reports, lambda report: (report, None, True)
 
     return _follow(start, source, output=output, metrics=metrics)
 
 
 def _follow(
-    start: "Callable[[StepListener], Started]",
+    start: "Callable[[StepListener], Run]",
     source: "FrameStream",
     *,
     output: Path,
@@ -270,7 +264,8 @@ def _follow(
     """
     from structgstream.data.source import frame_count
 
-    done, stored, read = start(lambda step: progress.step(step))  # progress needs the number of existing frames
+    run = start(lambda step: progress.step(step))  # progress needs the number of existing frames
+    done = run.done
     total, peaks, pressed = frame_count(source), dict[str, int](), StopSignal(number=signal.SIGINT)
 
     def message() -> str:
@@ -284,9 +279,10 @@ def _follow(
         StopSignal(stop_of(source)) as ending,
         monitored(source, metrics, done=done) as progress,
         pressed if in_qualities and total is not None else nullcontext(),
-        closing(stored) as reports,
+        closing(run.reports) as reports,
     ):
-        for report, quality, whole in map(read, reports):
+        for one in reports:
+            report, quality, whole = (one.report, one.quality, one.whole) if in_qualities else (one, None, True)
             on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
             for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
                 peaks[stage] = max(size, peaks.get(stage, 0))
@@ -334,8 +330,8 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
     )
     metrics = run_metrics(opened.source, options.output, qualities=names)
 
-    def start(on_step: "StepListener") -> "Started":
-        run = record_qualities(
+    def start(on_step: "StepListener") -> "Run":
+        return record_qualities(
             options.output,
             opened.source,
             config,
@@ -348,7 +344,6 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
             metrics=metrics,
             sound=opened.sound,
         )
-        return run.done, run.reports, lambda one: (one.report, one.quality, one.whole)
 
     _follow(start, opened.source, output=options.output, metrics=metrics, in_qualities=True)
     print_lines(console, f"Wrote {options.output}: {', '.join(names)}")
