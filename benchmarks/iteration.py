@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 
 from benchmarks.benchmark import PICTURES, Benchmark, Growth, Target, Variant
-from benchmarks.contenders import torch_but_raster
+from benchmarks.contenders import contenders
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.stages import staged
 from benchmarks.world import World, wall_world
@@ -64,8 +64,8 @@ def _shares(world: World, backend: Backend, iterations: int, threads: int) -> Ca
 
 
 def contestants(*, iterations: int, **sizes: int) -> list[Contestant]:
-    """Torch for all but the raster first, then the C++ with one and with two threads; ``sizes`` of the world."""
-    world, native = wall_world(cpu_backend(), **sizes), cpu_backend()
+    """The back-ends of whole fits; ``sizes`` of the world."""
+    world = wall_world(cpu_backend(), **sizes)
     return [
         Contestant(
             name,
@@ -74,11 +74,7 @@ def contestants(*, iterations: int, **sizes: int) -> list[Contestant]:
             units=iterations,
             facts=_shares(world, backend, iterations, threads),
         )
-        for name, backend, threads in (
-            ("torch but the raster, 2 threads", torch_but_raster(), 2),
-            ("cpu, 1 thread", native, 1),
-            ("cpu, 2 threads", native, 2),
-        )
+        for name, backend, threads in contenders()
     ]
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
-from benchmarks.contenders import torch_but_raster
+from benchmarks.contenders import contenders
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, fitted, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
@@ -73,11 +73,7 @@ def contestants(
 
     here = world(share)
     if contest == "back-ends":
-        return [
-            _fitting("torch but the raster, 2 threads", here, torch_but_raster(), paper),
-            _fitting("cpu, 1 thread", here, native, paper, threads=1),
-            _fitting("cpu, 2 threads", here, native, paper),
-        ]
+        return [_fitting(name, here, backend, paper, threads=threads) for name, backend, threads in contenders()]
     if contest == "shares":
         return [
             _fitting("everything moves, following motion", world(1.0), native, motion, compared=False),
