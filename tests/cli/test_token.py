@@ -47,13 +47,6 @@ def test_links(secret: Path, address: str, capsys: pytest.CaptureFixture[str]) -
     assert every == f"https://x.example/?token={printed(secret, capsys, '--every')}"
 
 
-def test_a_secret_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "short").write_text("short")
-    for name, words in (("short", "has 5 characters"), ("none", "cannot be read"), (".", "cannot be read")):
-        command = ["token", "studio", "--secret-file", str(tmp_path / name)]
-        assert words in error_of(command, capsys, status=2)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

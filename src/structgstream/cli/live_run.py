@@ -93,13 +93,6 @@ def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str]
     return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
 
 
-def stop_of(source: "FrameStream") -> Callable[[], object]:
-    """Ends a run that waits for live cameras; for a recording, does nothing."""
-    from structgstream.data.live.source import LiveSource
-
-    return source.stop if isinstance(source, LiveSource) else lambda: None
-
-
 @contextmanager
 def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> "Iterator[Display]":
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame being fitted."""

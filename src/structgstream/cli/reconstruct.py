@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import StopSignal, UsageError, interruption, usage_errors
-from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
+from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -262,8 +262,10 @@ def _follow(
 
     Ctrl-C interrupts a recording at once; live cameras and several qualities end after the frame being fitted.
     """
+    from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
 
+    stop = source.stop if isinstance(source, LiveSource) else lambda: None
     run = start(lambda step: progress.step(step))  # progress needs the number of existing frames
     done = run.done
     total, peaks, pressed = frame_count(source), dict[str, int](), StopSignal(number=signal.SIGINT)
@@ -276,7 +278,7 @@ def _follow(
 
     with (
         interruption(message),
-        StopSignal(stop_of(source)) as ending,
+        StopSignal(stop) as ending,
         monitored(source, metrics, done=done) as progress,
         pressed if in_qualities and total is not None else nullcontext(),
         closing(run.reports) as reports,
