@@ -77,7 +77,6 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
             found["growth"].append(outcome)
             print(*growth_lines(found, outcome), sep="\n", flush=True)
             if options.plots:
-                options.plots.mkdir(parents=True, exist_ok=True)
                 axis = re.sub(r"\W+", "_", growth.axis.split(" (")[0])
                 plot(benchmark.work, outcome, options.plots / f"{benchmark.name}_{axis}.png")
     result = {

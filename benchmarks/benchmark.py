@@ -11,6 +11,8 @@ from benchmarks.roofline import Peaks, Work, line
 
 Sizes = Mapping[str, Any]
 """Keyword arguments of ``contestants``."""
+PICTURES = ((240, 180), (340, 255), (480, 360), (680, 510), (960, 720))
+"""Widths and heights of which each has twice the pixels of the one before."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,13 @@ class Growth:
         axis: what grows, with its unit.
         full: the sizes, as arguments of ``contestants``, by the number that stands on the axis.
         quick: the same for a trial.
-        contestants: who runs; None is the benchmark's own.
+        only: names of the contestants that run, where others would take too long; all when empty.
     """
 
     axis: str
     full: Mapping[float, Sizes]
     quick: Mapping[float, Sizes]
-    contestants: Callable[..., list[Contestant]] | None = None
+    only: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -114,19 +116,10 @@ def run_variant(
 
 def judged(target: Target, entry: Mapping[str, Any]) -> dict[str, Any]:
     """A target and what was measured."""
+    asked = {name: value for name, value in vars(target).items() if value is not None}
     if target.at_least_times is not None:
         got = entry["times_faster"]["median"]
-        return {
-            "contestant": target.contestant,
-            "at_least_times": target.at_least_times,
-            "got": got,
-            "met": got >= target.at_least_times,
-        }
+        return asked | {"got": got, "met": got >= target.at_least_times}
     assert target.at_most_seconds is not None
     got = entry["seconds"]["median"]
-    return {
-        "contestant": target.contestant,
-        "at_most_seconds": target.at_most_seconds,
-        "got": got,
-        "met": got <= target.at_most_seconds,
-    }
+    return asked | {"got": got, "met": got <= target.at_most_seconds}

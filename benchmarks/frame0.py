@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame 0 of the bundled clip with few iterations: growth of anchors, small pictures first, nine training cameras."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 
 from benchmarks.benchmark import Benchmark, Variant
-from benchmarks.contenders import torch_but_raster
+from benchmarks.contenders import contenders
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import normalizing_similarity
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.points import initial_points
 from structgstream.data.source import resized
-from structgstream.kernels.backend import Backend, cpu_backend
+from structgstream.kernels.backend import Backend
 from structgstream.session.presets import FAST, TINY
 from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 
 
 def contestants(*, iterations: int, scale: float, points: int) -> list[Contestant]:
-    """Torch for all but the raster first, then the C++ with one and with two threads; ``points`` are made before."""
+    """The back-ends of whole fits; ``points`` are made before."""
     source = resized(bundled_clip(), scale)
     frame = next(iter(source.frames()))
     similarity = normalizing_similarity(source.rig, radius=TINY.NORMALISED_RADIUS)
@@ -56,17 +56,12 @@ def contestants(*, iterations: int, scale: float, points: int) -> list[Contestan
             fits[:] = [fit]
             return [torch.tensor(fit.train_psnr), torch.tensor(float(len(fit.scene.anchors)))]
 
-        return Contestant(name, run, threads, facts=_facts(fits))
+        def facts() -> Mapping[str, float]:
+            return {"train psnr": fits[0].train_psnr, "anchors": float(len(fits[0].scene.anchors))}
 
-    return [
-        entry("torch but the raster, 2 threads", torch_but_raster(), 2),
-        entry("cpu, 1 thread", cpu_backend(), 1),
-        entry("cpu, 2 threads", cpu_backend(), 2),
-    ]
+        return Contestant(name, run, threads, facts=facts)
 
-
-def _facts(fits: list[FitResult]) -> Callable[[], Mapping[str, float]]:
-    return lambda: {"train psnr": fits[0].train_psnr, "anchors": float(len(fits[0].scene.anchors))}
+    return [entry(*contender) for contender in contenders()]
 
 
 BENCHMARK = Benchmark(

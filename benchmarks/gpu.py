@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,18 +22,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.world import World, held_out_psnr, wall_world
+from benchmarks.stages import mapped
+from benchmarks.world import World, fitted, held_out_psnr, wall_world
 from structgstream.cameras import Camera, Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend
 from structgstream.kernels.values import FitFrame, Rasterizer, RasterOutput
-from structgstream.scene.render import render
+from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.state import on_device
 from structgstream.session.presets import COMPACT
-from structgstream.training.online.fit import fit_next_frame
-from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
-from structgstream.training.views import training_views
 
 BUDGET_SECONDS = 330.0
 SIZES = {
@@ -59,13 +58,7 @@ PREDICTED: Mapping[str, str] = {
 
 def moved(value: Any, device: torch.device) -> Any:
     """``value`` with copies of its tensors on ``device``."""
-    if isinstance(value, Tensor):
-        return value.detach().to(device, copy=True)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value) if f.init})
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(moved(part, device) for part in value))
-    return [moved(part, device) for part in value] if isinstance(value, list) else value
+    return mapped(value, lambda tensor: tensor.detach().to(device, copy=True))
 
 
 def copied(frame: FitFrame, device: torch.device) -> FitFrame:
@@ -112,21 +105,6 @@ class _Captured(Exception):
     """Ends a fit when its iterations would begin."""
 
 
-def fitted(world: World, backend: Backend) -> FitResult:
-    """An online frame of ``world``, its pictures prepared by the caller's thread."""
-    config = COMPACT.online
-    pictures = preprocess(
-        world.frame,
-        world.rig,
-        before=training_views(world.previous, world.rig, backend.device),
-        motion=config.motion,
-        scene_flow=config.scene_flow,
-        backend=backend,
-    )
-    scene = moved(world.before, backend.device)
-    return fit_next_frame(scene, world.frame, world.rig, config=config, backend=backend, seed=0, pictures=pictures)
-
-
 def fit_frame(world: World, backend: Backend) -> FitFrame:
     """What the iterations of a frame of ``world`` begin with."""
     found: list[FitFrame] = []
@@ -136,7 +114,7 @@ def fit_frame(world: World, backend: Backend) -> FitFrame:
         raise _Captured
 
     try:
-        fitted(world, replace(backend, iterations=begin))
+        fitted(world, replace(backend, iterations=begin), COMPACT.online)
     except _Captured:
         return found[0]
     raise AssertionError("the frame is fitted in torch")
@@ -260,8 +238,8 @@ class Measurement:
 
     def frame(self, name: str, world: World, backend: Backend) -> dict[str, Any]:
         fits: list[FitResult] = []
-        times = [self.seconds(lambda: fits.append(fitted(world, backend))) for _ in range(3)]
-        scene = moved(fits[-1].scene, torch.device("cpu"))
+        times = [self.seconds(lambda: fits.append(fitted(world, backend, COMPACT.online))) for _ in range(3)]
+        scene = on_device(fits[-1].scene, torch.device("cpu"))
         return {
             name: min(times),
             "first, s": times[0],
@@ -273,13 +251,11 @@ class Measurement:
         """Pictures a second, from the scene to bytes in the host's memory."""
         found = {}
         for title, world in self.worlds.items():
-            scene, cameras = moved(world.before, self.backend.device), list(world.rig.cameras.values())
+            scene, cameras = on_device(world.before, self.backend.device), list(world.rig.cameras.values())
 
             def draw(scene: Any = scene, cameras: Sequence[Any] = cameras) -> None:
-                with torch.no_grad():
-                    for camera in cameras:
-                        image = render(scene, camera, self.backend).image
-                        (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
+                for camera in cameras:
+                    to_8bit_image(render(scene, camera, self.backend).image)
 
             draw()
             found[title] = {"pictures a second": len(cameras) / self.seconds(draw)}
@@ -359,7 +335,7 @@ def main() -> None:
         measurement = Measurement(cuda_backend(), small, torch.cuda.synchronize)
         world, backend = measurement.worlds["small"], measurement.backend
         measurement.begin(fit_frame(world, backend))(0, 1)
-        scene, camera = moved(world.before, backend.device), next(iter(world.rig.cameras.values()))
+        scene, camera = on_device(world.before, backend.device), next(iter(world.rig.cameras.values()))
         drawn_with_gradients(backend.rasterize, scene.gaussians(camera, backend), camera)
         return
     if options.out is None:

@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """How seconds grow with size: sizes that double, the slope on log-log axes, a plot of each curve."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.benchmark import Benchmark, Growth
 from benchmarks.contest import TURN_SECONDS, check, spread, timed
 from benchmarks.machine import Instant, others_share
+from structgstream.figure import figure_of, save_figure
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> float:
     """Least-squares slope of log seconds over log size: 1 is linear, 0 does not depend on the size."""
-    x = [math.log(size) for size in sizes]
-    y = [math.log(value) for value in seconds]
-    middle_x, middle_y = sum(x) / len(x), sum(y) / len(y)
-    spread_x = sum((a - middle_x) ** 2 for a in x)
-    return sum((a - middle_x) * (b - middle_y) for a, b in zip(x, y, strict=True)) / spread_x
+    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
 
 
 def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: int) -> dict[str, Any]:
@@ -26,7 +24,8 @@ def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: in
     curves: dict[str, list[dict[str, Any]]] = {}
     before = Instant.now()
     for size, arguments in sizes.items():
-        entries = (growth.contestants or benchmark.contestants)(**arguments)
+        entries = benchmark.contestants(**arguments)
+        entries = [entry for entry in entries if not growth.only or entry.name in growth.only]
         check(entries, benchmark.quantities, oracle=benchmark.oracle(**arguments) if benchmark.oracle else None)
         seconds = timed(entries, repeats=repeats, turn_seconds=0.0 if quick else TURN_SECONDS)
         for entry in entries:
@@ -45,12 +44,8 @@ def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: in
 
 def plot(title: str, found: Mapping[str, Any], path: Path) -> None:
     """Draw one curve of :func:`run_growth` with its spread, log-log, the slope in the legend."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6.0, 4.0))
+    figure = figure_of(6.0, 4.0)
+    axes = figure.subplots()
     for name, points in found["curves"].items():
         sizes = [point["size"] for point in points]
         median = [1e3 * point["seconds"]["median"] for point in points]
@@ -70,6 +65,4 @@ def plot(title: str, found: Mapping[str, Any], path: Path) -> None:
     axes.set_xticks([], minor=True)
     axes.grid(visible=True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save_figure(figure, path)

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import torch
 
-from benchmarks.benchmark import Benchmark, Growth, Target, Variant
-from benchmarks.contenders import torch_but_raster
+from benchmarks.benchmark import PICTURES, Benchmark, Growth, Target, Variant
+from benchmarks.contenders import contenders
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.stages import staged
 from benchmarks.world import World, wall_world
@@ -63,10 +63,9 @@ def _shares(world: World, backend: Backend, iterations: int, threads: int) -> Ca
     return facts
 
 
-def _contestants(
-    backends: Mapping[str, tuple[Backend, int]], *, anchors: int, width: int, height: int, cameras: int, iterations: int
-) -> list[Contestant]:
-    world = wall_world(cpu_backend(), anchors=anchors, width=width, height=height, cameras=cameras)
+def contestants(*, iterations: int, **sizes: int) -> list[Contestant]:
+    """The back-ends of whole fits; ``sizes`` of the world."""
+    world = wall_world(cpu_backend(), **sizes)
     return [
         Contestant(
             name,
@@ -75,36 +74,8 @@ def _contestants(
             units=iterations,
             facts=_shares(world, backend, iterations, threads),
         )
-        for name, (backend, threads) in backends.items()
+        for name, backend, threads in contenders()
     ]
-
-
-def contestants(*, anchors: int, width: int, height: int, cameras: int, iterations: int) -> list[Contestant]:
-    """Torch for all but the raster first, then the C++ with one and with two threads."""
-    return _contestants(
-        {
-            "torch but the raster, 2 threads": (torch_but_raster(), 2),
-            "cpu, 1 thread": (cpu_backend(), 1),
-            "cpu, 2 threads": (cpu_backend(), 2),
-        },
-        anchors=anchors,
-        width=width,
-        height=height,
-        cameras=cameras,
-        iterations=iterations,
-    )
-
-
-def natives(*, anchors: int, width: int, height: int, cameras: int, iterations: int) -> list[Contestant]:
-    """The C++ with two threads alone, for growth."""
-    return _contestants(
-        {"cpu, 2 threads": (cpu_backend(), 2)},
-        anchors=anchors,
-        width=width,
-        height=height,
-        cameras=cameras,
-        iterations=iterations,
-    )
 
 
 def _sizes(anchors: int = 20_000, width: int = 480, height: int = 360, cameras: int = 8) -> dict[str, int]:
@@ -115,7 +86,7 @@ def _quick(anchors: int = 60, width: int = 48, height: int = 36, cameras: int = 
     return {"anchors": anchors, "width": width, "height": height, "cameras": cameras, "iterations": 4}
 
 
-PIXELS = ((240, 180), (340, 255), (480, 360), (680, 510), (960, 720))
+NATIVE = ("cpu, 2 threads",)
 
 BENCHMARK = Benchmark(
     name="iteration",
@@ -132,19 +103,19 @@ BENCHMARK = Benchmark(
             "anchors",
             {n: _sizes(anchors=n) for n in (2_500, 5_000, 10_000, 20_000, 40_000, 80_000)},
             {n: _quick(anchors=n) for n in (30, 60)},
-            natives,
+            only=NATIVE,
         ),
         Growth(
             "pixels (20,000 anchors)",
-            {w * h: _sizes(width=w, height=h) for w, h in PIXELS},
+            {w * h: _sizes(width=w, height=h) for w, h in PICTURES},
             {w * h: _quick(width=w, height=h) for w, h in ((32, 24), (48, 36))},
-            natives,
+            only=NATIVE,
         ),
         Growth(
             "cameras",
             {n: _sizes(cameras=n) for n in (4, 8, 16, 32)},
             {n: _quick(cameras=n) for n in (2, 4)},
-            natives,
+            only=NATIVE,
         ),
     ],
     targets=[Target("cpu, 2 threads", at_least_times=3.0), Target("cpu, 2 threads", at_most_seconds=0.060)],

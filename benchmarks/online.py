@@ -12,16 +12,13 @@ from typing import Literal
 import torch
 
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
-from benchmarks.contenders import torch_but_raster
+from benchmarks.contenders import contenders
 from benchmarks.contest import Contestant, Quantity, Results
-from benchmarks.world import World, held_out_psnr, wall_world
+from benchmarks.world import World, fitted, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.session.presets import MOTION, PAPER
 from structgstream.training.online.config import MotionConfig, OnlineConfig
-from structgstream.training.online.fit import fit_next_frame
-from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
-from structgstream.training.views import training_views
 
 NOISE = 1.0  # Levels of 255: what a good camera leaves after denoising.
 Contest = Literal["back-ends", "shares", "pictures", "growth"]
@@ -49,19 +46,8 @@ def _fitting(
     fits: list[FitResult] = []
 
     def run() -> Results:
-        pictures = preprocess(
-            world.frame,
-            world.rig,
-            before=training_views(world.previous, world.rig, backend.device),
-            motion=config.motion,
-            scene_flow=config.scene_flow,
-            backend=backend,
-        )
-        fit = fit_next_frame(
-            world.before, world.frame, world.rig, config=config, backend=backend, seed=0, pictures=pictures
-        )
-        fits[:] = [fit]
-        quality = held_out_psnr(fit.scene, world, cpu_backend())
+        fits[:] = [fitted(world, backend, config)]
+        quality = held_out_psnr(fits[0].scene, world, cpu_backend())
         return [torch.tensor(quality)] if compared else [None]
 
     def facts() -> Mapping[str, float]:
@@ -87,11 +73,7 @@ def contestants(
 
     here = world(share)
     if contest == "back-ends":
-        return [
-            _fitting("torch but the raster, 2 threads", here, torch_but_raster(), paper),
-            _fitting("cpu, 1 thread", here, native, paper, threads=1),
-            _fitting("cpu, 2 threads", here, native, paper),
-        ]
+        return [_fitting(name, here, backend, paper, threads=threads) for name, backend, threads in contenders()]
     if contest == "shares":
         return [
             _fitting("everything moves, following motion", world(1.0), native, motion, compared=False),

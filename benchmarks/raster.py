@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.benchmark import Benchmark, Growth, Variant
+from benchmarks.benchmark import PICTURES, Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity
 from benchmarks.roofline import Work
 from structgstream.cameras import Viewport
@@ -50,7 +50,7 @@ def forward_and_backward(rasterize: Rasterizer, work: Workload) -> list[Tensor]:
     return [output.image, *torch.autograd.grad(output.image, inputs, cotangent)]
 
 
-def contestants(*, splats: int = 60_000, width: int = 480, height: int = 360) -> list[Contestant]:
+def contestants(*, splats: int, width: int, height: int) -> list[Contestant]:
     """The torch reference first, then the C++ with one and with two threads."""
     work = workload(splats, width, height)
     return [
@@ -58,11 +58,6 @@ def contestants(*, splats: int = 60_000, width: int = 480, height: int = 360) ->
         Contestant("cpu, 1 thread", partial(forward_and_backward, cpu_raster.rasterize, work), 1),
         Contestant("cpu, 2 threads", partial(forward_and_backward, cpu_raster.rasterize, work), 2),
     ]
-
-
-def natives(*, splats: int, width: int, height: int) -> list[Contestant]:
-    """The C++ alone, for sizes at which the reference takes seconds."""
-    return contestants(splats=splats, width=width, height=height)[1:]
 
 
 def blended_pairs(work: Workload) -> float:
@@ -111,28 +106,30 @@ def _sizes(splats: int, width: int, height: int) -> dict[str, int]:
     return {"splats": splats, "width": width, "height": height}
 
 
+NATIVE = ("cpu, 1 thread", "cpu, 2 threads")  # at large sizes the reference takes seconds
+
 BENCHMARK = Benchmark(
     name="raster",
     work="rasterisation of one picture, forward and backward",
     contestants=contestants,
+    # Float32 against float32; measured medians are under 1e-5.
     quantities=[
-        Quantity(name, 1e-4, "median")  # Float32 against float32; measured medians are under 1e-5.
-        for name in ("image", "means' gradient", "quats' gradient", "scales' gradient", "opacities' gradient")
-    ]
-    + [Quantity("colors' gradient", 1e-4, "median")],
+        Quantity(name, 1e-4, "median")
+        for name in ("image", *(f"{part}' gradient" for part in ("means", "quats", "scales", "opacities", "colors")))
+    ],
     variants=[Variant("60,000 splats, 480x360", _sizes(60_000, 480, 360), _sizes(500, 64, 48))],
     growth=[
         Growth(
             "splats",
             {n: _sizes(n, 480, 360) for n in (7_500, 15_000, 30_000, 60_000, 120_000, 240_000)},
             {n: _sizes(n, 64, 48) for n in (250, 500)},
-            natives,
+            only=NATIVE,
         ),
         Growth(
             "pixels (as many splats as a third of the pixels)",
-            {w * h: _sizes(w * h // 3, w, h) for w, h in ((240, 180), (340, 255), (480, 360), (680, 510), (960, 720))},
+            {w * h: _sizes(w * h // 3, w, h) for w, h in PICTURES},
             {w * h: _sizes(w * h // 3, w, h) for w, h in ((32, 24), (64, 48))},
-            natives,
+            only=NATIVE,
         ),
     ],
     count=count,

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A viewer's frame: a packet is decoded to a scene, which a held-out camera draws."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
-from benchmarks.benchmark import Benchmark, Growth, Variant
+from benchmarks.benchmark import PICTURES, Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import HELD_OUT, moved, wall_rig, wall_scene
 from structgstream.cameras import Similarity
@@ -67,34 +67,24 @@ def _viewing(header: StreamHeader, packets: list[Packet], backend: Backend) -> C
     return run
 
 
-def _contestants(backends: Mapping[str, tuple[Backend, int]], anchors: int, width: int, height: int):
+def contestants(*, anchors: int, width: int, height: int) -> list[Contestant]:
+    """The torch reference first, then the C++ with one and with two threads."""
     header, packets = stream(anchors, width=width, height=height)
     return [
         Contestant(name, _viewing(header, packets, backend), threads, units=FRAMES)
-        for name, (backend, threads) in backends.items()
+        for name, backend, threads in (
+            ("torch reference, 2 threads", reference_backend(), 2),
+            ("cpu, 1 thread", cpu_backend(), 1),
+            ("cpu, 2 threads", cpu_backend(), 2),
+        )
     ]
-
-
-def contestants(*, anchors: int, width: int, height: int) -> list[Contestant]:
-    """The torch reference first, then the C++ with one and with two threads."""
-    backends = {
-        "torch reference, 2 threads": (reference_backend(), 2),
-        "cpu, 1 thread": (cpu_backend(), 1),
-        "cpu, 2 threads": (cpu_backend(), 2),
-    }
-    return _contestants(backends, anchors, width, height)
-
-
-def natives(*, anchors: int, width: int, height: int) -> list[Contestant]:
-    """The C++ with two threads alone, for growth."""
-    return _contestants({"cpu, 2 threads": (cpu_backend(), 2)}, anchors, width, height)
 
 
 def _sizes(anchors: int = 20_000, width: int = 480, height: int = 360) -> dict[str, int]:
     return {"anchors": anchors, "width": width, "height": height}
 
 
-PIXELS = ((240, 180), (340, 255), (480, 360), (680, 510), (960, 720))
+NATIVE = ("cpu, 2 threads",)
 
 BENCHMARK = Benchmark(
     name="render",
@@ -108,13 +98,13 @@ BENCHMARK = Benchmark(
             "anchors",
             {n: _sizes(anchors=n) for n in (2_500, 5_000, 10_000, 20_000, 40_000, 80_000)},
             {n: _sizes(n, 48, 36) for n in (30, 60)},
-            natives,
+            only=NATIVE,
         ),
         Growth(
             "pixels (20,000 anchors)",
-            {w * h: _sizes(width=w, height=h) for w, h in PIXELS},
+            {w * h: _sizes(width=w, height=h) for w, h in PICTURES},
             {w * h: _sizes(60, w, h) for w, h in ((32, 24), (48, 36))},
-            natives,
+            only=NATIVE,
         ),
     ],
     per_second="frames a second",

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.benchmark import Benchmark, Growth, Target, Variant
+from benchmarks.benchmark import PICTURES, Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.roofline import Work
 from structgstream.kernels import cpu_losses, reference_losses
@@ -107,12 +107,6 @@ def oracle(*, width: int, height: int) -> Results:
     return _ours(reference_losses.l1_ssim, image.double(), target.double())
 
 
-def natives(*, width: int, height: int) -> list[Contestant]:
-    """The torch form and the C++ with two threads, for growth."""
-    found = contestants(width=width, height=height)
-    return [found[0], found[2]]
-
-
 def count(*, width: int, height: int) -> Work:
     """Operations and bytes of value and gradient.
 
@@ -140,9 +134,9 @@ BENCHMARK = Benchmark(
     growth=[
         Growth(
             "pixels",
-            {w * h: {"width": w, "height": h} for w, h in ((240, 180), (340, 255), (480, 360), (680, 510), (960, 720))},
+            {w * h: {"width": w, "height": h} for w, h in PICTURES},
             {w * h: {"width": w, "height": h} for w, h in ((32, 32), (64, 48))},
-            natives,
+            only=("torch grouped convolution, 2 threads", "cpu, 2 threads"),
         )
     ],
     targets=[Target("cpu, 2 threads", at_least_times=8.0)],

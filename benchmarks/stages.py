@@ -7,7 +7,7 @@ implements it. Nothing else of an iteration's graph is ready to run in between.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -32,41 +32,35 @@ class _Mark(torch.autograd.Function):
         return None, *gradients
 
 
-def _tensors_of(value: Any) -> list[Tensor]:
-    """The tensors in ``value`` that carry gradients: nested tuples, dictionaries and dataclasses are looked into."""
+def mapped(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """``value`` with ``change`` of its tensors: nested tuples, lists, dictionaries and dataclasses are looked into."""
     if isinstance(value, Tensor):
-        return [value] if value.requires_grad else []
-    return [tensor for part in _parts(value) for tensor in _tensors_of(part)]
-
-
-def _parts(value: Any) -> list[Any]:
+        return change(value)
     if isinstance(value, Mapping):
-        return list(value.values())
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return list(value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return [getattr(value, field.name) for field in fields(value)]
-    return []
-
-
-def _with_tensors(value: Any, marked: list[Tensor]) -> Any:
-    """``value`` with its gradient-carrying tensors taken from the front of ``marked``."""
-    if isinstance(value, Tensor):
-        return marked.pop(0) if value.requires_grad else value
-    if isinstance(value, Mapping):
-        return {key: _with_tensors(part, marked) for key, part in value.items()}
+        return {key: mapped(part, change) for key, part in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(_with_tensors(part, marked) for part in value))
+        return type(value)(*(mapped(part, change) for part in value))
     if isinstance(value, list | tuple):
-        return type(value)(_with_tensors(part, marked) for part in value)
+        return type(value)(mapped(part, change) for part in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: _with_tensors(getattr(value, f.name), marked) for f in fields(value)})
+        return replace(value, **{f.name: mapped(getattr(value, f.name), change) for f in fields(value) if f.init})
     return value
 
 
 def _marked(value: Any, noted: Callable[[], None]) -> Any:
-    tensors = _tensors_of(value)
-    return _with_tensors(value, list(_Mark.apply(noted, *tensors))) if tensors else value  # type: ignore[call-overload]
+    """``value`` with its tensors that carry gradients passed through one mark."""
+    carrying: list[Tensor] = []
+
+    def found(tensor: Tensor) -> Tensor:
+        if tensor.requires_grad:
+            carrying.append(tensor)
+        return tensor
+
+    mapped(value, found)
+    if not carrying:
+        return value
+    marked = iter(_Mark.apply(noted, *carrying))  # type: ignore[call-overload]
+    return mapped(value, lambda tensor: next(marked) if tensor.requires_grad else tensor)
 
 
 def staged(backend: Backend, seconds: dict[str, float]) -> Backend:

@@ -10,17 +10,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.evaluation.camera_path import look_at
+from structgstream.evaluation.metrics import psnr
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
-from structgstream.scene.render import render
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import fit_next_frame
+from structgstream.training.online.preprocess import preprocess
+from structgstream.training.result import FitResult
+from structgstream.training.views import training_views
 
 WALL_WIDTH, WALL_HEIGHT = 2.8, 2.1
 DISTANCE = 2.4
@@ -98,17 +105,9 @@ def wall_rig(cameras: int, *, width: int, height: int) -> CameraRig:
         eye = torch.stack([DISTANCE * angle.sin(), up, -DISTANCE * angle.cos()])
         focal = FOCAL * width
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-        found[name] = Camera(_looking_at_the_middle(eye), K, width, height, near=0.1)
+        viewmat = look_at(eye, torch.zeros_like(eye), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+        found[name] = Camera(viewmat, K, width, height, near=0.1)
     return CameraRig(found, held_out=frozenset({HELD_OUT}))
-
-
-def _looking_at_the_middle(eye: Tensor) -> Tensor:
-    z = torch.nn.functional.normalize(-eye, dim=0)
-    x = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=z.dtype), z), dim=0)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.stack([x, torch.linalg.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return viewmat
 
 
 def moved(scene: Scene, *, share: float, shift: tuple[float, float, float]) -> Scene:
@@ -123,8 +122,7 @@ def moved(scene: Scene, *, share: float, shift: tuple[float, float, float]) -> S
 
 def picture(scene: Scene, camera: Camera, backend: Backend) -> NDArray[np.uint8]:
     """What ``camera`` records, ``[H, W, 3]`` uint8."""
-    image = render(scene, camera, backend).image
-    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    return to_8bit_image(render(scene, camera, backend).image)
 
 
 def wall_world(
@@ -158,8 +156,20 @@ def wall_world(
     return World(rig, before, taken(before, 0), taken(after, 1))
 
 
+def fitted(world: World, backend: Backend, config: OnlineConfig) -> FitResult:
+    """Frame 1 fitted from the true scene of frame 0; its pictures are prepared by the caller's thread."""
+    pictures = preprocess(
+        world.frame,
+        world.rig,
+        before=training_views(world.previous, world.rig, backend.device),
+        motion=config.motion,
+        scene_flow=config.scene_flow,
+        backend=backend,
+    )
+    scene = on_device(world.before, backend.device)
+    return fit_next_frame(scene, world.frame, world.rig, config=config, backend=backend, seed=0, pictures=pictures)
+
+
 def held_out_psnr(scene: Scene, world: World, backend: Backend) -> float:
     """PSNR of ``scene`` against frame 1 at the held-out camera, dB."""
-    shown = picture(scene, world.rig[HELD_OUT], backend).astype(np.float64)
-    error = np.mean((shown - world.frame.images[HELD_OUT]) ** 2) / 255.0**2
-    return float(-10.0 * np.log10(max(error, 1e-10)))
+    return psnr(picture(scene, world.rig[HELD_OUT], backend), world.frame.images[HELD_OUT])

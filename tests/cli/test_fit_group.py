@@ -10,10 +10,12 @@ from typing import Any
 
 import pytest
 
-from structgstream.cli import groups, main
+from structgstream.cli import main
 from structgstream.groups import unit
 from structgstream.groups.first_frame import GroupStartConfig
+from structgstream.training.result import Step
 from tests.support.quick_streams import CLIP, error_of
+from tests.support.reports import frame_report
 from tests.support.streams import small_stream
 
 
@@ -21,36 +23,6 @@ from tests.support.streams import small_stream
 def words(tmp_path: Path) -> list[str]:
     (tmp_path / "header.sgs").write_bytes(small_stream(1))
     return ["fit-group", CLIP, "--init", str(tmp_path / "header.sgs"), "-o", str(tmp_path / "g.sgs")]
-
-
-class Shown:
-    """A display that keeps what it is shown."""
-
-    def __init__(self) -> None:
-        self.reported: list[Any] = []
-
-    def __call__(self, frames: int, *, done: int) -> "Shown":
-        self.reported.append((frames, done))
-        return self
-
-    def __enter__(self) -> "Shown":
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        pass
-
-    def step(self, step: object) -> None:
-        self.reported.append(step)
-
-    def frame(self, report: Any) -> None:
-        self.reported.append(report.index)
-
-
-@pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    made = Shown()
-    monkeypatch.setattr(groups, "display", made)
-    return made
 
 
 def fits(monkeypatch: pytest.MonkeyPatch, *, done: int, then: object = None) -> list[Any]:
@@ -64,8 +36,8 @@ def fits(monkeypatch: pytest.MonkeyPatch, *, done: int, then: object = None) -> 
                     if isinstance(then, BaseException):
                         raise then
                     os.kill(os.getpid(), signal.SIGTERM)
-                on_step(f"step {index}")
-                yield SimpleNamespace(index=index)
+                on_step(Step(1, 2, 0.5, 10, 0))
+                yield frame_report(index)
 
         asked.append((path, task, overwrite))
         return SimpleNamespace(done=done, reports=reports())
@@ -75,7 +47,7 @@ def fits(monkeypatch: pytest.MonkeyPatch, *, done: int, then: object = None) -> 
 
 
 def test_what_is_asked_for_is_fitted_and_shown(
-    words: list[str], shown: Shown, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = fits(monkeypatch, done=61)
     given = ["--frames", "60:63", "--track", "t", "--iterations", "9", "--rounds", "2", "--overwrite"]
@@ -83,8 +55,9 @@ def test_what_is_asked_for_is_fitted_and_shown(
     start = GroupStartConfig(iterations=9, rounds=2)
     task = unit.SegmentTask(Path(CLIP), Path(words[3]), Path("t"), 60, 63, start)
     assert asked == [(Path(words[5]), task, True)]
-    assert shown.reported == [(63, 61), "step 61", 61, "step 62", 62]
-    assert capsys.readouterr().out == f"Wrote {words[5]}\n"
+    *frames, last = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in frames] == ["frame 62/63", "frame 63/63"]
+    assert last == f"Wrote {words[5]}"
 
 
 def test_a_finished_segment_is_said_to_be(
@@ -98,7 +71,6 @@ def test_a_finished_segment_is_said_to_be(
 @pytest.mark.parametrize(("then", "status"), [(KeyboardInterrupt(), 130), ("SIGTERM", 143)])
 def test_interrupted_it_says_what_is_safe(
     words: list[str],
-    shown: Shown,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     then: object,

@@ -6,12 +6,10 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Event
 
 import pytest
 
 from structgstream.cli.app import INTERRUPTED, PROBLEM, USAGE, main
-from structgstream.cli.live_run import stop_on_interrupt
 from structgstream.codec.reader import open_stream
 from structgstream.data.live.source import LiveSource
 from structgstream.data.open import open_capture
@@ -64,18 +62,6 @@ def test_options_of_live_cameras_need_the_word(tmp_path: Path, capsys) -> None:
     for options in (["--record", str(tmp_path / "take")], []):
         assert main(["reconstruct", str(rig), "-o", str(tmp_path / "x.sgs"), *options]) == USAGE
         assert "give --live" in capsys.readouterr().err
-
-
-def test_ctrl_c_ends_after_the_frame_and_twice_at_once(capsys) -> None:
-    pressed, before = Event(), signal.getsignal(signal.SIGINT)
-    with stop_on_interrupt(pressed.is_set, pressed.set):
-        os.kill(os.getpid(), signal.SIGINT)
-        assert pressed.is_set()
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
-    assert "Ends after this frame" in capsys.readouterr().err
-    assert INTERRUPTED == 130
 
 
 def test_ctrl_c_before_the_first_frame_leaves_no_stream(tmp_path: Path, capsys, monkeypatch) -> None:

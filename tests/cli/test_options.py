@@ -10,7 +10,6 @@ from structgstream.cli.app import UsageError, main
 from structgstream.cli.groups import Join
 from structgstream.cli.options import (
     CaptureOptions,
-    check_ending,
     open_selected_capture,
     parse_known_options,
     parse_options,
@@ -18,10 +17,6 @@ from structgstream.cli.options import (
 )
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.session.presets import DEFAULT_PRESET, PRESETS
-
-
-def test_no_option_is_the_whole_capture() -> None:
-    assert parse_options(CaptureOptions, "reconstruct", arguments=[]) == CaptureOptions()
 
 
 def test_options_of_a_capture_choose_its_part() -> None:
@@ -96,8 +91,3 @@ def test_json_to_standard_output_is_nothing_else(capsys: pytest.CaptureFixture[s
     printed = capsys.readouterr()
     assert json.loads(printed.out).keys() == {"environment", "backends", "packages"}
     assert "back-end" in printed.err
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.PNG", "folder", "take.2026-11-27"])
-def test_an_output_that_is_written_is_not(name: str) -> None:
-    check_ending(Path(name), ".mp4", ".png", command="render")

@@ -28,7 +28,7 @@ def test_each_group_has_a_sign_and_many_share_one_that_shows_the_least_done() ->
 
 def test_the_state_in_words() -> None:
     assert counted(STATUS) == "1 of 4 groups done (30 of 100 frames), 1 running, 1 ready, 1 waiting for the track"
-    assert counted(Status("header")) == "frame 0"
+    assert [counted(Status(stage)) for stage in ("header", "track", "join")] == ["frame 0", "tracking begins", "join"]
     assert counted(replace(STATUS, stage="join")) == "joining, 1 of 4 groups done (30 of 100 frames)"
 
 
@@ -58,11 +58,6 @@ def test_any_number_of_groups_fits_and_a_failure_is_always_seen(states: list[Sta
     assert all(len(line) <= width for line in lines)
     assert ("✗" in "".join(lines)) == (State.FAILED in states)
     assert ("".join(lines) == "●" * len("".join(lines))) == (set(states) == {State.DONE})
-
-
-def test_the_stages_before_groups_are_known_have_words() -> None:
-    assert counted(Status("track")) == "tracking begins"
-    assert counted(Status("join")) == "join"
 
 
 def test_of_many_running_groups_some_are_shown_and_the_rest_counted() -> None:

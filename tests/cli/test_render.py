@@ -104,11 +104,12 @@ def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> 
         assert render.default_output(options, reader) == Path("videos") / name
 
 
-def test_a_stream_without_frames_is_not_rendered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stream_without_frames_is_not_rendered_nor_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = tmp_path / "empty.sgs"
     write_stream(FileSink(empty), [], header=header_for(small_scene()))
     for more in ([], ["--path", "orbit"]):
         assert "no whole frame" in error_of(["render", str(empty), *more], capsys, status=2)
+    assert "no whole frame, so there is nothing to score" in error_of(["evaluate", str(empty), CLIP], capsys, status=2)
 
 
 def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:

@@ -1,31 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands ``serve`` and ``token``."""
 
-import http.client
 import os
-import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import urllib.error
+import urllib.request
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from structgstream.cli import main
+from tests.support.quick_streams import error_of
+from tests.support.running_commands import RunningCommand, running_command
 from tests.support.segment_folders import GrowingFolder
 from tests.support.streams import small_stream
 
 STREAM = small_stream()
 SECRET = "a secret of thirty-two characters\n"
-PATIENCE_SECONDS = 60.0
-COMMAND = """
-import runpy, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-runpy.run_module("structgstream", run_name="__main__", alter_sys=True)
-"""
 
 
 @pytest.fixture
@@ -35,45 +29,29 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "streams"
 
 
-@contextmanager
-def serving(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
-    """The command in a process of its own, and its port."""
-    printed = folder.parent / "printed"
-    with printed.open("wb") as output:
-        command = [sys.executable, "-c", COMMAND, "serve", str(folder), "--port", "0", *arguments]
-        process = subprocess.Popen(command, stdout=output, stderr=output)
+def serving(folder: Path, *arguments: str) -> AbstractContextManager[RunningCommand]:
+    return running_command(folder.parent, "serve", str(folder), "--port", "0", *arguments)
+
+
+def status(address: str) -> int:
     try:
-        last = time.monotonic() + PATIENCE_SECONDS
-        while not (found := re.search(r"http://127\.0\.0\.1:(\d+)/", printed.read_text())):
-            assert time.monotonic() < last, printed.read_text()
-            time.sleep(0.1)
-        yield process, int(found[1])
-    finally:
-        process.kill()
-        process.wait()
+        with urllib.request.urlopen(address, timeout=20) as response:
+            return response.status
+    except urllib.error.HTTPError as error:
+        return error.code
 
 
-def status(port: int, path: str) -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    connection.request("GET", path)
-    found = connection.getresponse().status
-    connection.close()
-    return found
-
-
-def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, expected: int = 0) -> str:
+def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     capsys.readouterr()
-    assert main(arguments) == expected
-    captured = capsys.readouterr()
-    return captured.err if expected else captured.out
+    assert main(arguments) == 0
+    return capsys.readouterr().out
 
 
 def test_it_serves_until_ctrl_c(folder: Path) -> None:
-    with serving(folder) as (process, port):
-        assert status(port, "/streams/studio/manifest.json") == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_SECONDS) == 0
-    lines = (folder.parent / "printed").read_text().splitlines()
+    with serving(folder) as command:
+        assert status(f"{command.address()}streams/studio/manifest.json") == 200
+        assert command.ended_by(signal.SIGINT) == 0
+    lines = command.printed.read_text().splitlines()
     assert len(lines) == 1
     assert lines[0].startswith(f"The streams of {folder} are at http://127.0.0.1:")
 
@@ -83,17 +61,16 @@ def test_a_token_opens_what_a_secret_guards_until_sigterm(folder: Path, capsys: 
     token = output_of(["token", "studio", *secret], capsys).strip()
     short = output_of(["token", "studio", "--hours", "0.0000001", *secret], capsys).strip()
     every = output_of(["token", "--every", *secret], capsys).strip()
-    with serving(folder, *secret) as (process, port):
-        link = output_of(["token", "studio", *secret, "--address", f"http://127.0.0.1:{port}"], capsys).strip()
-        assert link.startswith(f"http://127.0.0.1:{port}/streams/studio/?token=v1.")
-        assert status(port, link.removeprefix(f"http://127.0.0.1:{port}")) == 200
-        manifest = "/streams/studio/manifest.json"
+    with serving(folder, *secret) as command:
+        address = command.address()
+        link = output_of(["token", "studio", *secret, "--address", address], capsys).strip()
+        assert link.startswith(f"{address}streams/studio/?token=v1.")
+        assert status(link) == 200
         for text, expected in ((token, 200), (every, 200), (short, 401), ("", 401)):
-            assert status(port, f"{manifest}?token={text}") == expected
-        assert status(port, f"/?token={every}") == 200
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_SECONDS) == -signal.SIGTERM
-    assert "Viewers need a token" in (folder.parent / "printed").read_text()
+            assert status(f"{address}streams/studio/manifest.json?token={text}") == expected
+        assert status(f"{address}?token={every}") == 200
+        assert command.ended_by(signal.SIGTERM) == -signal.SIGTERM
+    assert "Viewers need a token" in command.printed.read_text()
 
 
 @pytest.mark.parametrize(
@@ -112,15 +89,15 @@ def test_a_token_opens_what_a_secret_guards_until_sigterm(folder: Path, capsys: 
 def test_what_is_refused(
     folder: Path, arguments: list[str], expected: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = output_of(["serve", str(folder), *arguments], capsys, expected=expected)
+    error = error_of(["serve", str(folder), *arguments], capsys, status=expected)
     assert words in error
     assert len(error.strip().splitlines()) == 1
 
 
 def test_what_is_no_folder_of_streams(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "cannot be read" in output_of(["serve", str(folder / "none")], capsys, expected=1)
+    assert "cannot be read" in error_of(["serve", str(folder / "none")], capsys, status=1)
     file = folder / "studio" / "manifest.json"
-    assert "is a file; serve takes a folder" in output_of(["serve", str(file)], capsys, expected=1)
+    assert "is a file; serve takes a folder" in error_of(["serve", str(file)], capsys, status=1)
 
 
 def test_a_missing_extra_is_reported(
@@ -131,7 +108,7 @@ def test_a_missing_extra_is_reported(
     for name in [name for name in sys.modules if name.split(".")[0] == "uvicorn"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "uvicorn", None)  # type: ignore[arg-type]
-    assert "pip install 'structgstream[serve]'" in output_of(["serve", str(folder)], capsys, expected=1)
+    assert "pip install 'structgstream[serve]'" in error_of(["serve", str(folder)], capsys, status=1)
 
 
 def test_the_server_needs_no_torch(folder: Path) -> None:

@@ -40,14 +40,6 @@ def test_a_line_for_each_step_with_its_time(clock: Clock) -> None:
     ]
 
 
-def test_a_long_line_is_not_broken() -> None:
-    to = console()
-    with StepDisplay(to) as display:
-        display.begin("find", skipped=True)
-        display.end("find", "x" * 300)
-    assert len(text(to).splitlines()) == 1
-
-
 def test_a_terminal_shows_the_running_step_and_what_it_is_at() -> None:
     to = console(terminal=True)
     with StepDisplay(to) as display:

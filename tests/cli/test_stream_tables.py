@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of numbers that are given here. How they look for real streams is in ``test_inspect.py``."""
 
-import io
 from dataclasses import replace
 from typing import Any
 
 import pytest
-from rich.console import Console
 from rich.table import Table
 
 from structgstream.cli.inspect import bit_rate_text, facts_table, header_table, packet_table, period_table
 from structgstream.evaluation.byte_count import Row
+from tests.support.consoles import console, text
 
 HEADER: dict[str, Any] = {
     "metadata": {"capture": "hall [1]"},
@@ -38,10 +37,9 @@ def rows(count: int, *, bytes: int = 100) -> list[Row]:
 
 
 def shown(table: Table) -> list[str]:
-    console = Console(file=io.StringIO(), width=100, color_system=None)
-    console.print(table)
-    assert isinstance(console.file, io.StringIO)
-    return [" ".join(line.split()) for line in console.file.getvalue().splitlines() if line.strip()]
+    to = console(width=100)
+    to.print(table)
+    return [" ".join(line.split()) for line in text(to).splitlines() if line.strip()]
 
 
 def packet(changes: dict[str, int], counts: dict[str, int]) -> dict[str, Any]:

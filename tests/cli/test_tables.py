@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers as tables for a terminal, from scores that are made up."""
 
-import io
 from dataclasses import fields, replace
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from structgstream.cli.evaluate import quality_text, report_tables
 from structgstream.cli.progress import SHOWN_FRAMES
 from structgstream.evaluation.report import FrameScores, Report, Scores
+from tests.support.consoles import console, text
 
 FACTS: dict[str, Any] = {
     "metrics": "all", "not_available": {}, "cameras": {"cam[0]": "held out"}, "absent_frames": {}, "masked_share": {},
@@ -47,15 +46,14 @@ def report(frames: int = 4, **facts: Any) -> Report:
 
 
 def shown(of: Report, *, title: str = "ball.sgs") -> str:
-    console = Console(file=io.StringIO(), width=200, color_system=None)
-    console.print(report_tables(of, title=title))
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    to = console(width=200)
+    to.print(report_tables(of, title=title))
+    return text(to)
 
 
-def row(text: str, first: str) -> list[str]:
+def row(printed: str, first: str) -> list[str]:
     """The words of the line that begins so."""
-    return next(line.split() for line in text.splitlines() if line.strip().startswith(first))
+    return next(line.split() for line in printed.splitlines() if line.strip().startswith(first))
 
 
 def test_frames_and_their_mean() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first SIGTERM asks, the second ends."""
+"""The first SIGTERM or Ctrl-C asks, the second ends."""
 
 import os
 import signal
@@ -7,48 +7,49 @@ import threading
 
 import pytest
 
-from structgstream.cli.app import Terminated, Termination
+from structgstream.cli.app import StopSignal, Terminated
 
 
-def send() -> None:
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
-    before, asked = signal.getsignal(signal.SIGTERM), []
-    with Termination(lambda: asked.append(True)) as ending:
-        os.kill(os.getpid(), signal.SIGTERM)
+@pytest.mark.parametrize(
+    ("number", "raised", "said"),
+    [(signal.SIGTERM, Terminated, ""), (signal.SIGINT, KeyboardInterrupt, "Ends after this frame; Ctrl-C again")],
+)
+def test_the_first_signal_is_remembered_and_the_second_ends(
+    number: signal.Signals, raised: type[BaseException], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, asked = signal.getsignal(number), []
+    with StopSignal(lambda: asked.append(True), number=number) as ending:
+        ending.end(whole=False)
+        os.kill(os.getpid(), number)
         assert (ending.asked, asked) == (True, [True])
-        with pytest.raises(Terminated, match="was given up"):
-            os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
+        assert capsys.readouterr().err.startswith(said)
+        ending.end(whole=True)
+        with pytest.raises(raised):
+            ending.end(whole=False)
+        with pytest.raises(raised):
+            os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is before
 
 
 def test_what_was_there_before_comes_back_however_the_block_ends() -> None:
     heard: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
     try:
-        with Termination():
+        with StopSignal():
             pass
-        with pytest.raises(KeyError), Termination():
+        with pytest.raises(KeyError), StopSignal():
             raise KeyError
-        send()
+        os.kill(os.getpid(), signal.SIGTERM)
         assert heard == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def test_nothing_is_asked_where_no_signal_came() -> None:
-    with Termination(lambda: pytest.fail("nobody asked")) as ending:
-        assert not ending.asked
-    assert not ending.asked
 
 
 def test_another_thread_has_no_signals_and_changes_nothing() -> None:
     before, found = signal.getsignal(signal.SIGTERM), []
 
     def run() -> None:
-        with Termination() as ending:
+        with StopSignal() as ending:
             found.append((ending.asked, signal.getsignal(signal.SIGTERM)))
 
     thread = threading.Thread(target=run)
@@ -56,12 +57,3 @@ def test_another_thread_has_no_signals_and_changes_nothing() -> None:
     thread.join()
     assert found == [(False, before)]
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_an_error_of_who_is_woken_is_not_lost() -> None:
-    def broken() -> None:
-        raise RuntimeError("cannot wake")
-
-    with pytest.raises(RuntimeError, match="cannot wake"), Termination(broken) as ending:
-        send()
-    assert ending.asked

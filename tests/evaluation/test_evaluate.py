@@ -3,7 +3,8 @@
 
 import mmap
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import pytest
 import torch
 
 from structgstream.cameras import Similarity
-from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.contents import PacketInfo
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.sinks import MemorySink
 from structgstream.data.images import ImageSource
 from structgstream.data.source import section
 from structgstream.errors import CaptureError
@@ -25,79 +28,52 @@ from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
 from tests.support.reports import mean_of
-from tests.support.worlds import World, emerging_ball, moving_world
+from tests.support.streams import header_for, write_stream
+from tests.support.worlds import World, emerging_ball, moving_world, rendered
 
 SPEED = 0.03
 
 
-@dataclass
-class Info:
-    kind: PacketKind
-    index: int
-    pts_seconds: float
-    offset: int
-    bytes: int
-    field_bytes: dict[str, int]
+def scenes_of(world: World, *, follow: bool = True) -> list[Scene]:
+    """Every frame's own scene, or the first one for ever."""
+    anchors = world.scene.anchors
+    shifts = [torch.tensor([SPEED * t * follow, 0.0, 0.0]) for t in range(len(world.frames))]
+    return [replace(world.scene, anchors=replace(anchors, positions=anchors.positions + shift)) for shift in shifts]
 
 
-@dataclass
-class Reader:
-    """What an opened file looks like, around scenes in memory."""
+class Reader(StreamReader):
+    """Gives scenes as the world draws them: without the low-pass of the training pictures."""
 
-    header: StreamHeader
-    decoded: list[Scene]
-    complete: bool = True
-    header_bytes: int = 5000
-    packets: list[Info] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        for i in range(len(self.decoded)):
-            kind = PacketKind.DELTA if i else PacketKind.KEY
-            self.packets.append(Info(kind, i, i / 30, 0, 1000 + i, {"anchor_positions": 900, "free": i}))
-
-    @property
-    def total_bytes(self) -> int:
-        return self.header_bytes + sum(info.bytes for info in self.packets)
-
-    def scenes(self, start: int) -> Iterator[tuple[Info, Scene]]:
-        yield from zip(self.packets[start:], self.decoded[start:])
+    def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
+        for info, scene in super().scenes(start):
+            yield info, replace(scene, sampling=None)
 
 
-def in_the_stream(world: World, *, similarity: Similarity, follow: bool) -> Reader:
-    """The world as a stream: every frame's own scene, or the first one for ever."""
-    scenes = []
-    for t in range(len(world.frames)):
-        shift = torch.tensor([SPEED * t * follow, 0.0, 0.0])
-        anchors = world.scene.anchors
-        moved = similarity.points(anchors.positions + shift).to(torch.float32)
-        growth = float(np.log(similarity.scale))
-        scenes.append(
-            replace(
-                world.scene,
-                anchors=replace(
-                    anchors,
-                    positions=moved,
-                    log_offset_scales=anchors.log_offset_scales + growth,
-                    log_base_scales=anchors.log_base_scales + growth,
-                ),
-            )
+def in_the_stream(
+    world: World, *, follow: bool = True, similarity: Similarity | None = None, **metadata: int
+) -> Reader:
+    """The world as a stream, in the units of the similarity."""
+    similarity = similarity or Similarity()
+    growth = float(np.log(similarity.scale))
+    scaled = [
+        replace(
+            scene,
+            anchors=replace(
+                scene.anchors,
+                positions=similarity.points(scene.anchors.positions).to(torch.float32),
+                log_offset_scales=scene.anchors.log_offset_scales + growth,
+                log_base_scales=scene.anchors.log_base_scales + growth,
+            ),
         )
-    header = StreamHeader(
-        rig=world.rig,
-        similarity=similarity,
-        fps=30.0,
-        codec="raw",
-        dynamic=PAPER_DYNAMIC,
-        static={},
-        distance_input=True,
-        config={},
-        metadata={"capture": "world"},
-    )
-    return Reader(header, scenes)
+        for scene in scenes_of(world, follow=follow)
+    ]
+    sink = MemorySink()
+    header = replace(header_for(scaled[0]), rig=world.rig, similarity=similarity, metadata=metadata)
+    write_stream(sink, scaled, header=header)
+    return Reader(sink.data)
 
 
 @pytest.fixture(autouse=True)
@@ -117,7 +93,7 @@ def run(reader: Any, source: Any, **options: Any):
 
 
 def test_a_perfect_stream_scores_as_equal(world: World) -> None:
-    report = run(in_the_stream(world, similarity=Similarity(), follow=True), MemoryCapture(world.rig, world.frames))
+    report = run(in_the_stream(world), MemoryCapture(world.rig, world.frames))
     assert report.mean.psnr == PSNR_OF_EQUALS
     assert report.mean.ssim == pytest.approx(1.0)
     assert report.stream["drift_db_per_frame"] == pytest.approx(0.0)
@@ -126,7 +102,7 @@ def test_a_perfect_stream_scores_as_equal(world: World) -> None:
 
 
 def test_a_stream_that_stands_still_loses_the_changed_pixels(world: World) -> None:
-    report = run(in_the_stream(world, similarity=Similarity(), follow=False), MemoryCapture(world.rig, world.frames))
+    report = run(in_the_stream(world, follow=False), MemoryCapture(world.rig, world.frames))
     psnrs = [mean_of(frame).psnr for frame in report.frames]
     assert psnrs == sorted(psnrs, reverse=True)
     assert report.stream["drift_db_per_frame"] < -1
@@ -136,41 +112,21 @@ def test_a_stream_that_stands_still_loses_the_changed_pixels(world: World) -> No
     assert last.psnr_still is not None
     assert last.psnr_changed < last.psnr < last.psnr_still
     assert mean_of(report.frames[0]).psnr_changed is None
-    assert [frame.kind for frame in report.frames] == ["key", "delta", "delta", "delta"]
+    assert [frame.kind for frame in report.frames] == ["key", "delta", "delta", "key"]
 
 
 def test_cameras_pass_through_the_similarity_of_the_header(world: World) -> None:
-    # The MLPs see the distance, so the world is drawn without it to be the same at another scale.
-    blind = replace(world.scene, mlps=replace_distance(world.scene))
-    plain = World(world.rig, blind, drawn(blind, world))
-    similarity = Similarity(center=(0.3, -0.2, 0.1), scale=2.5)
-    report = run(in_the_stream(plain, similarity=similarity, follow=True), MemoryCapture(plain.rig, plain.frames))
+    # The MLPs see the distance, their last input, so the world is drawn without it to be the same at another scale.
+    for head in (mlps := deepcopy(world.scene.mlps)):
+        head.w1[:, -1] = 0.0
+    plain = replace(world, scene=replace(world.scene, mlps=mlps))
+    frames = [
+        replace(frame, images={name: rendered(scene, world, name) for name in world.rig})
+        for frame, scene in zip(world.frames, scenes_of(plain), strict=True)
+    ]
+    reader = in_the_stream(plain, similarity=Similarity(center=(0.3, -0.2, 0.1), scale=2.5))
+    report = run(reader, MemoryCapture(world.rig, frames))
     assert report.mean.psnr > 60  # float32 of another scale: a level here and there
-
-
-def replace_distance(scene: Scene):
-    """The MLPs with no weight on the distance, which is the last input."""
-    mlps = scene.mlps
-    heads = {}
-    for name in ("opacity", "color", "covariance"):
-        head = getattr(mlps, name)
-        weights = head.w1.clone()
-        weights[:, -1] = 0.0
-        heads[name] = head._replace(w1=weights)
-    return type(mlps)(**heads)
-
-
-def drawn(scene: Scene, world: World) -> list[MultiViewFrame]:
-    """The world's frames with another scene."""
-    from tests.support.worlds import rendered
-
-    frames = []
-    for t, frame in enumerate(world.frames):
-        shift = torch.tensor([SPEED * t, 0.0, 0.0])
-        moved = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + shift))
-        images = {name: rendered(moved, world, name) for name in world.rig}
-        frames.append(MultiViewFrame(frame.index, frame.pts_seconds, images))
-    return frames
 
 
 def exposed(frames: list[MultiViewFrame], *, gains: list[float]) -> list[MultiViewFrame]:
@@ -183,7 +139,7 @@ def exposed(frames: list[MultiViewFrame], *, gains: list[float]) -> list[MultiVi
 
 
 def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader = in_the_stream(world)
     report = run(reader, MemoryCapture(world.rig, exposed(world.frames, gains=[0.7, 0.7, 0.7, 0.5])))
     held = [value for frame in report.frames if (value := mean_of(frame).psnr_camera_color) is not None]
     assert len(held) == 4
@@ -206,7 +162,7 @@ def new_pages(size: int) -> mmap.mmap:
 @pytest.mark.skipif(resident_bytes() is None, reason="the system does not tell the resident size")
 def test_the_evaluations_own_memory_is_reported(world: World) -> None:
     """A picture set that is there while frames are scored counts."""
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader = in_the_stream(world)
     held = []
     before = resident_bytes()
     assert before is not None
@@ -222,7 +178,7 @@ def test_the_evaluations_own_memory_is_reported(world: World) -> None:
 
 def test_the_observer_sees_every_picture(world: World) -> None:
     seen = []
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader = in_the_stream(world)
     run(
         reader,
         MemoryCapture(world.rig, world.frames),
@@ -236,8 +192,8 @@ def test_the_observer_sees_every_picture(world: World) -> None:
 def test_every_score_over_time_is_wired(world: World) -> None:
     """A world that moves, followed and not: what changes from frame to frame, and what is said of what is missing."""
     source = MemoryCapture(world.rig, world.frames)
-    follows = run(in_the_stream(world, similarity=Similarity(), follow=True), source)
-    stays = run(in_the_stream(world, similarity=Similarity(), follow=False), source)
+    follows = run(in_the_stream(world), source)
+    stays = run(in_the_stream(world, follow=False), source)
     assert follows.mean.flip == follows.mean.temporal_flip == 0.0
     assert stays.mean.flip is not None
     assert stays.mean.flip > 0.01
@@ -258,7 +214,7 @@ def test_every_score_over_time_is_wired(world: World) -> None:
 
 
 def test_the_basic_scores_are_those_of_before(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=False)
+    reader = in_the_stream(world, follow=False)
     basic, every = (run(reader, MemoryCapture(world.rig, world.frames), metrics=which) for which in ("basic", "all"))
     assert basic.stream["metrics"] == "basic"
     assert basic.stream["not_available"] == {}
@@ -267,8 +223,7 @@ def test_the_basic_scores_are_those_of_before(world: World) -> None:
 
 
 def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    reader.header = replace(reader.header, metadata={"start": 2})
+    reader = in_the_stream(world, start=2)
     whole: Any = MemoryCapture(world.rig, world.frames * 2)
     assert numbers_of(whole) is None
     assert numbers_of(section(whole, start=1)) is None
@@ -281,10 +236,9 @@ def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
 
 
 def test_a_part_of_another_step_is_refused(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
     pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 16 for name in world.rig})
     for stated, step in (({}, 2), ({"every": 2}, 1), ({"every": 2}, 3)):
-        reader.header = replace(reader.header, metadata={"start": 1, **stated})
+        reader = in_the_stream(world, start=1, **stated)
         with pytest.raises(CaptureError, match=rf"1 in {stated.get('every', 1)} frames .* 1 in {step}; .*every="):
             run(reader, section(pictures, start=1, every=step))
 
@@ -303,15 +257,15 @@ class Ball:
 
 
 def test_another_methods_file_is_scored_alike(world: World) -> None:
-    reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
-    reader.decoded = [Ball(1.0), Ball(1.0), Ball(0.5), Ball(0.5)]
+    reader: Any = in_the_stream(world)
+    reader.scenes = lambda start: zip(reader.packets, [Ball(1.0), Ball(1.0), Ball(0.5), Ball(0.5)], strict=True)
     report = run(reader, MemoryCapture(world.rig, world.frames))
     assert [(frame.anchors, frame.free) for frame in report.frames] == [(0, 1)] * 4
     assert 5 < report.mean.psnr < 40
 
 
 def test_other_sizes_and_the_worst_frames_are_in_the_report(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=False)
+    reader = in_the_stream(world, follow=False)
     rig = world.rig.mapped({name: world.rig[name].resized(96, 64) for name in world.rig})
     frames = [
         replace(one, images={n: p.repeat(2, 0).repeat(2, 1) for n, p in one.images.items()}) for one in world.frames

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics against closed forms and scikit-image."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from pytorch_msssim import ms_ssim as their_ms_ssim
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 
 from structgstream.evaluation.metrics import (
     PSNR_OF_EQUALS,
@@ -15,11 +13,9 @@ from structgstream.evaluation.metrics import (
     psnr,
     squared_errors,
     ssim,
-    ssim_map,
 )
-from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.kernels.native import native_reason
 from structgstream.scene.render import to_8bit_image
+from tests.support.backends import quickest_backend
 
 
 def pictures(height: int = 37, width: int = 53) -> tuple[np.ndarray, np.ndarray]:
@@ -45,28 +41,15 @@ def test_equal_pictures_have_a_finite_psnr() -> None:
     assert psnr(picture, picture) == PSNR_OF_EQUALS
 
 
-def test_ssim_away_from_the_border_agrees_with_scikit_image() -> None:
+def test_the_ssim_of_a_mask_is_the_mean_of_its_pixels() -> None:
+    """What the numbers are: kernels/test_reference_losses.py and parity/test_ssim.py."""
     picture, truth = pictures()
-    theirs = structural_similarity(
-        truth,
-        picture,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )[1]
-    ours = ssim_map(picture, truth).permute(1, 2, 0).numpy()
-    # float32 moments: 1e-7 of a squared mean against the 9e-4 of C2.
-    np.testing.assert_allclose(ours[5:-5, 5:-5], theirs[5:-5, 5:-5], atol=1e-4)
-
-
-@pytest.mark.parametrize("build", [reference_backend, cpu_backend])
-def test_every_backend_gives_the_mean_of_the_map(build: Callable[[], Backend]) -> None:
-    picture, truth = pictures()
-    if build is cpu_backend and native_reason() is not None:
-        pytest.skip(str(native_reason()))
-    assert ssim(picture, truth, build()) == pytest.approx(float(ssim_map(picture, truth).mean()), abs=1e-6)
+    left, right = np.zeros((2, *truth.shape[:2]), bool)
+    left[:, :20] = right[:, 20:] = True
+    halves = [ssim(picture, truth, quickest_backend(), mask) for mask in (left, right)]
+    whole = ssim(picture, truth, quickest_backend())
+    assert (20 * halves[0] + 33 * halves[1]) / 53 == pytest.approx(whole, abs=1e-6)
+    assert halves[0] != pytest.approx(halves[1], abs=1e-4)
 
 
 @pytest.mark.parametrize(("height", "width"), [(176, 208), (161, 171), (181, 200)])

@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.evaluation.evaluate import half_scores, halved, stored_size
+from structgstream.evaluation.evaluate import frames_at_stored_size, half_scores, halved, stored_scores
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS, counting, score
 from structgstream.evaluation.pictures import block_mask, block_means
-from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render, to_8bit_image
 from tests.support.backends import quickest_backend
-from tests.support.memory_captures import MemoryCapture
 from tests.support.rigs import arc_rig
 from tests.support.worlds import World, moving_world
 
@@ -77,25 +75,22 @@ def test_half_size_compares_with_the_mean_of_the_truth(world: World) -> None:
     backend, camera = quickest_backend(), world.rig["cam00"]
     small = to_8bit_image(render(world.scene, halved(camera), backend).image)
     truth = small.repeat(2, 0).repeat(2, 1)
-    scores = half_scores(world.scene, halved(camera), truth, backend=backend)
+    scores = half_scores(world.scene, camera, truth, backend=backend)
     assert scores["psnr_half"] == PSNR_OF_EQUALS
     assert scores["ssim_half"] == pytest.approx(1.0)
     dark = np.where(truth > 20, truth - 20, truth).astype(np.uint8)
     mask = np.min(truth, axis=2) > 20
     masked = half_scores(
-        world.scene, halved(camera), np.where(mask[..., None], dark, 0).astype(np.uint8), backend=backend, mask=mask
+        world.scene, camera, np.where(mask[..., None], dark, 0).astype(np.uint8), backend=backend, mask=mask
     )
     assert masked["psnr_half"] == pytest.approx(20 * np.log10(255 / 20))
 
 
 def test_the_stored_size_is_scored_in_few_spread_frames(world: World) -> None:
-    backend = quickest_backend()
-    rig = world.rig.mapped({name: world.rig[name].resized(96, 64) for name in world.rig})
-    picture = to_8bit_image(render(world.scene, rig["cam00"], backend).image)
-    frames = [MultiViewFrame(i, i / 30, {"cam00": picture}) for i in range(20)]
-    large = stored_size(MemoryCapture(rig, frames), {"cam00": world.rig["cam00"]}, backend=backend, frames=20)
-    assert sorted(large.frames) == [0, 5, 10, 14, 19]
-    for index in (0, 1, 14):
-        scores = large.scores("cam00", world.scene, index=index)
-        assert scores == ({} if index == 1 else pytest.approx({"psnr_stored": PSNR_OF_EQUALS, "ssim_stored": 1.0}))
-    assert stored_size(large.source, large.views, backend=backend, frames=3).frames == {2}
+    """What is seen where: test_evaluate.py."""
+    assert frames_at_stored_size(20) == [0, 5, 10, 14, 19]
+    assert frames_at_stored_size(3) == [2]
+    backend, camera = quickest_backend(), world.rig["cam00"]
+    picture = to_8bit_image(render(world.scene, camera.resized(96, 64), backend).image)
+    scores = stored_scores(world.scene, camera, picture, backend=backend)
+    assert scores == pytest.approx({"psnr_stored": PSNR_OF_EQUALS, "ssim_stored": 1.0})

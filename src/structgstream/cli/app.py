@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType, ModuleType
+from typing import Any
 
 from structgstream.errors import ConfigError, OutOfMemoryError, StructGStreamError
 
@@ -229,40 +230,41 @@ class Terminated(KeyboardInterrupt):
     """The process was asked to end, as by Ctrl-C; the message states what is stored and how to continue."""
 
 
-class Termination:
-    """Within its ``with`` block the first SIGTERM only sets :attr:`asked`; a second one raises Terminated at once.
+class StopSignal:
+    """Within its ``with`` block the first SIGTERM, or the first Ctrl-C, only sets :attr:`asked`; a second one raises
+    Terminated or KeyboardInterrupt at once.
 
     At the first one the signal's handler calls ``on_ask``, to wake what waits for frames. Only the main thread receives
     signals, so elsewhere the block changes nothing.
     """
 
-    def __init__(self, on_ask: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, on_ask: Callable[[], object] = lambda: None, *, number: signal.Signals = signal.SIGTERM) -> None:
         self.asked = False
-        self._on_ask = on_ask
-        self._before: object = None
+        self._on_ask, self._number = on_ask, number
+        self._before: Any = None
 
-    def __enter__(self) -> "Termination":
-        try:
-            self._before = signal.signal(signal.SIGTERM, self._handle)
-        except ValueError:  # not the main thread
-            self._before = None
+    def __enter__(self) -> "StopSignal":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(self._number, self._handle)
         return self
 
     def __exit__(self, *raised: object) -> None:
-        if callable(self._before) or isinstance(self._before, int):
-            signal.signal(signal.SIGTERM, self._before)  # type: ignore[arg-type]
+        if self._before is not None:
+            signal.signal(self._number, self._before)
 
     def end(self, *, whole: bool) -> None:
         """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway. Raises
-        Terminated if it was."""
+        Terminated or KeyboardInterrupt if it was."""
         if self.asked and not whole:
-            raise Terminated
+            raise Terminated if self._number == signal.SIGTERM else KeyboardInterrupt
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
-            raise Terminated("The frame being fitted was given up.")
+            raise Terminated("The frame being fitted was given up.") if number == signal.SIGTERM else KeyboardInterrupt
         self.asked = True
         self._on_ask()
+        if number == signal.SIGINT:
+            _print_error("Ends after this frame; Ctrl-C again ends at once.")
 
 
 AGAIN_SECONDS = 3.0

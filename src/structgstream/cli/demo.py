@@ -2,10 +2,9 @@
 """``structgstream demo``."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -15,13 +14,6 @@ from structgstream.cli.evaluate import quality_text, report_tables
 from structgstream.cli.options import Device, check_ending, parse_known_options, resolve_config
 from structgstream.cli.progress import print_lines
 
-if TYPE_CHECKING:
-    from structgstream.data.source import FrameSource
-    from structgstream.evaluation.report import Report
-    from structgstream.kernels.backend import Backend
-    from structgstream.session.presets import StreamConfig
-
-PLAYER = "player.html"
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
 
 
@@ -51,91 +43,65 @@ def main(arguments: list[str]) -> None:
     check_ending(options.output, command="demo", folder=True)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
+    from structgstream.cli.evaluate import run_evaluation
+    from structgstream.cli.reconstruct import run_reconstruction
+    from structgstream.cli.render import path_pictures, write_pictures
+    from structgstream.codec.reader import open_stream
     from structgstream.data.dataset_layouts import bundled_clip_path
     from structgstream.data.open import open_capture
+    from structgstream.evaluation.evaluate import compared_frames
+    from structgstream.evaluation.pictures import side_by_side
     from structgstream.kernels.backend import select_backend
     from structgstream.recorder import check_output
+    from structgstream.serve.pages import StreamFile, write_page
     from structgstream.session.presets import DEMO_PRESET
 
-    began = time.perf_counter()
-    console = Console()
+    began, console = time.perf_counter(), Console()
     config, preset = resolve_config(options.preset or DEMO_PRESET, rest, command="demo", seed=None)
     source = open_capture(bundled_clip_path(), scale=options.scale, frames=options.frames)
     backend = select_backend(options.device)
-    stream = options.output / "clip.sgs"
+    folder, camera = options.output, source.rig.testing[0]
+    stream, player, report_folder = folder / "clip.sgs", folder / "player.html", folder / "report"
+    held_out, orbit = folder / "held-out.mp4", folder / "orbit.mp4"
     check_output(stream, may_exist=True)
-    _reconstruct(stream, source, config, backend, preset=preset, scale=options.scale, console=console)
-    report, files = _look_at(stream, source, backend)
-    _print_results(console, report, files, seconds=time.perf_counter() - began)
-    player = options.output / PLAYER
+    console.print(
+        f"Reconstructing the bundled clip: {len(source.rig.training)} training cameras of "
+        f"{source.rig[camera].width}x{source.rig[camera].height}, {len(source)} frames, preset {preset}, back-end "
+        f"{backend.name}.",
+        highlight=False,
+    )
+    metadata = {"preset": preset, "start": 0, "scale": options.scale}
+    try:
+        run_reconstruction(source, config, output=stream, backend=backend, metadata=metadata)
+    except Interrupted:
+        raise Interrupted(f"What was done is in {folder}; the demo starts again from the beginning.") from None
+
+    reader = open_stream(stream)
+    report = run_evaluation(reader, source, stream=stream, backend=backend, cameras=None, folder=report_folder)
+    pairs = compared_frames(reader, source, backend=backend, camera=camera)
+    write_pictures(held_out, (side_by_side(*pair) for pair in pairs), fps=source.fps * SLOWED)
+    write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
+    write_page(player, StreamFile(stream))
+
+    console.print(report_tables(report, title="bundled clip, held-out camera"))
+    console.print()
+    for name, path in (
+        ("stream", stream),
+        ("worst frames", report_folder / "index.html"),
+        ("pictures", report_folder / "contact_sheet.png"),
+        ("plots", report_folder / "over_time.png"),
+        ("numbers", report_folder / "report.json"),
+        ("held-out view", f"{held_out} (truth, rendering, difference x4; a fifth of the speed)"),
+        ("moving camera", orbit),
+    ):
+        print_lines(console, f"{name:<14}  {path}")
+    seconds = time.perf_counter() - began
+    console.print(
+        f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, everything in {seconds:.0f} s.",
+        highlight=False,
+    )
     print_lines(
         console,
         f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
         f"or, next to the cameras' pictures: structgstream play {stream} --capture {bundled_clip_path()}",
-    )
-
-
-def _reconstruct(
-    stream: Path,
-    source: "FrameSource",
-    config: "StreamConfig",
-    backend: "Backend",
-    *,
-    preset: str,
-    scale: float,
-    console: Console,
-) -> None:
-    """The clip as a stream."""
-    from structgstream.cli.reconstruct import run_reconstruction
-
-    filmed = source.rig[source.rig.testing[0]]
-    console.print(
-        f"Reconstructing the bundled clip: {len(source.rig.training)} training cameras of "
-        f"{filmed.width}x{filmed.height}, {len(source)} frames, preset {preset}, back-end {backend.name}.",
-        highlight=False,
-    )
-    metadata = {"preset": preset, "start": 0, "scale": scale}
-    try:
-        run_reconstruction(source, config, output=stream, backend=backend, metadata=metadata)
-    except Interrupted:
-        raise Interrupted(f"What was done is in {stream.parent}; the demo starts again from the beginning.") from None
-
-
-def _look_at(stream: Path, source: "FrameSource", backend: "Backend") -> tuple["Report", dict[str, Path | str]]:
-    """Scores, pictures, videos and the page with the player beside the stream; the scores, and where the rest is."""
-    from structgstream.cli.evaluate import run_evaluation
-    from structgstream.cli.render import path_pictures, write_pictures
-    from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.evaluate import compared_frames
-    from structgstream.evaluation.pictures import side_by_side
-    from structgstream.serve.pages import StreamFile, write_page
-
-    folder, camera = stream.parent, source.rig.testing[0]
-    reader = open_stream(stream)
-    report = run_evaluation(reader, source, stream=stream, backend=backend, cameras=None, folder=folder / "report")
-    held_out, orbit = folder / "held-out.mp4", folder / "orbit.mp4"
-    pairs = compared_frames(reader, source, backend=backend, camera=camera)
-    write_pictures(held_out, (side_by_side(*pair) for pair in pairs), fps=source.fps * SLOWED)
-    write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
-    write_page(folder / PLAYER, StreamFile(stream))
-    return report, {
-        "stream": stream,
-        "worst frames": folder / "report" / "index.html",
-        "pictures": folder / "report" / "contact_sheet.png",
-        "plots": folder / "report" / "over_time.png",
-        "numbers": folder / "report" / "report.json",
-        "held-out view": f"{held_out} (truth, rendering, difference x4; a fifth of the speed)",
-        "moving camera": orbit,
-    }
-
-
-def _print_results(console: Console, report: "Report", files: Mapping[str, Path | str], *, seconds: float) -> None:
-    """The scores, and where everything was written."""
-    console.print(report_tables(report, title="bundled clip, held-out camera"))
-    console.print()
-    for name, path in files.items():
-        print_lines(console, f"{name:<14}  {path}")
-    console.print(
-        f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, everything in {seconds:.0f} s.",
-        highlight=False,
     )

@@ -11,6 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from structgstream.cli.app import UsageError
 from structgstream.cli.options import (
     Device,
     Folder,
@@ -79,6 +80,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
+    if not reader.packets:
+        raise UsageError("the stream has no whole frame, so there is nothing to score.")
     source, stored = captures_of(reader.header, options.scene, frames=len(reader.packets))
     report = run_evaluation(
         reader,
@@ -118,7 +121,7 @@ def run_evaluation(
     from structgstream.evaluation.worst import WorstPictures, write_page
 
     frames = len(reader.packets)
-    wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()
+    wanted = set(spread_indices(frames, SHEET_COLUMNS))
     compared_pictures: dict[str, dict] = {}
     worst = WorstPictures()
     console = Console(stderr=True)
@@ -152,10 +155,17 @@ def run_evaluation(
     return report
 
 
-BASIC = ("PSNR", "colour", "SSIM", "changed", "still")
-"""Titles of the first columns of every table of scores; colour is PSNR after frame 0's colour fit."""
+Columns = Sequence[tuple[str, str, int, int]]
+"""Title, key, factor and digits of scores."""
 
-FURTHER = (  # title, key, factor, digits
+BASIC: Columns = (  # colour is PSNR after frame 0's colour fit
+    ("PSNR", "psnr", 1, 2),
+    ("colour", "psnr_camera_color", 1, 2),
+    ("SSIM", "ssim", 1, 4),
+    ("changed", "psnr_changed", 1, 2),
+    ("still", "psnr_still", 1, 2),
+)
+FURTHER: Columns = (
     ("MS-SSIM", "ms_ssim", 1, 4),
     ("FLIP", "flip", 1, 4),
     ("LPIPS", "lpips_alex", 1, 4),
@@ -166,8 +176,7 @@ FURTHER = (  # title, key, factor, digits
     ("flicker", "flicker", 1, 2),
     ("truth", "truth_flicker", 1, 2),
 )
-
-AT_OTHER_SIZES = (  # title, key, factor, digits
+AT_OTHER_SIZES: Columns = (
     ("half", "psnr_half", 1, 2),
     ("SSIM", "ssim_half", 1, 4),
     ("stored", "psnr_stored", 1, 2),
@@ -193,7 +202,7 @@ def report_tables(report: "Report", *, title: str) -> Group:
 def _frames(report: "Report", title: str) -> Table:
     table = compact_table()
     table.title = Text(title)
-    for name in ("frame", *BASIC, "bytes", "anchors", "free", "seconds"):
+    for name in ("frame", *(title for title, *_ in BASIC), "bytes", "anchors", "free", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
     frames = report.frames
     step = -(-len(frames) // SHOWN_FRAMES)
@@ -201,7 +210,7 @@ def _frames(report: "Report", title: str) -> Table:
         seconds = frame.log.get("total_seconds")
         table.add_row(
             str(frame.index),
-            *_scores(frame.mean),
+            *_cells(frame.mean, BASIC),
             human_bytes(frame.bytes),
             f"{frame.anchors:,}",
             f"{frame.free:,}",
@@ -209,25 +218,23 @@ def _frames(report: "Report", title: str) -> Table:
         )
     table.add_section()
     mean_bytes = sum(frame.bytes for frame in frames) / len(frames)
-    table.add_row("mean", *_scores(report.mean), human_bytes(mean_bytes), "", "", "", style="bold")
+    table.add_row("mean", *_cells(report.mean, BASIC), human_bytes(mean_bytes), "", "", "", style="bold")
     return table
 
 
 def _cameras(report: "Report") -> Table:
-    table = compact_table("camera", "", *BASIC, "affine", left=("camera", ""))
+    columns = (*BASIC, ("affine", "psnr_affine", 1, 2))
+    table = compact_table("camera", "", *(title for title, *_ in columns), left=("camera", ""))
     for name, scores in report.cameras.items():
-        affine = f"{scores.psnr_affine:.2f}"
-        table.add_row(*literal_cells(name, report.stream["cameras"][name]), *_scores(scores), affine)
+        table.add_row(*literal_cells(name, report.stream["cameras"][name]), *_cells(scores, columns))
     return table
 
 
-def _by_camera(report: "Report", columns: Sequence[tuple[str, str, int, int]]) -> Table:
+def _by_camera(report: "Report", columns: Columns) -> Table:
     """The scores of ``columns`` by camera, and their mean."""
     table = compact_table("camera", *(title for title, *_ in columns), left=("camera",))
     for name, scores in (*report.cameras.items(), ("mean", report.mean)):
-        values = [(getattr(scores, key), factor, digits) for _, key, factor, digits in columns]
-        cells = ["-" if v is None else f"{factor * v:.{digits}f}" for v, factor, digits in values]
-        table.add_row(*literal_cells(name), *cells)
+        table.add_row(*literal_cells(name), *_cells(scores, columns))
     return table
 
 
@@ -310,12 +317,10 @@ def _facts(report: "Report") -> Table:
     return table
 
 
-def _scores(scores: "Scores | None") -> list[str]:
-    if scores is None:  # Every scored camera is absent.
-        return ["-"] * len(BASIC)
-    values = (scores.psnr, scores.psnr_camera_color, scores.ssim, scores.psnr_changed, scores.psnr_still)
-    digits = (2, 2, 4, 2, 2)
-    return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
+def _cells(scores: "Scores | None", columns: Columns) -> list[str]:
+    """The scores of ``columns``; None where every scored camera is absent."""
+    values = [(scores and getattr(scores, key), factor, digits) for _, key, factor, digits in columns]
+    return ["-" if value is None else f"{factor * value:.{digits}f}" for value, factor, digits in values]
 
 
 def quality_text(report: "Report") -> str:

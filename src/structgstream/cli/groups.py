@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from structgstream.cli.app import Termination, UsageError, interruption, usage_errors
+from structgstream.cli.app import StopSignal, UsageError, interruption, usage_errors
 from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, check_new, parse_options
 from structgstream.cli.progress import display, frames_text, human_bytes, print_lines
 
@@ -108,7 +108,7 @@ def _track(
         interruption(
             lambda: f"Frame {done} of {last} was tracked; give the same command to go on from the last start."
         ),
-        Termination() as ending,
+        StopSignal() as ending,
         Progress(*columns, TimeRemainingColumn(), console=Console()) as bars,
         closing(track_capture(path, source, base, options, backend)) as frames,
     ):
@@ -204,7 +204,7 @@ def _fit(options: FitGroup, task: "SegmentTask") -> bool:
     done, frames = run.done, task.end - task.first
     with (
         interruption(lambda: f"{done - task.first} of {frames} frames are safe; give the same command to go on."),
-        Termination() as ending,
+        StopSignal() as ending,
         display(task.end, done=done) as progress,
         closing(run.reports) as reports,
     ):

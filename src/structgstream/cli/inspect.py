@@ -305,11 +305,6 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
         numbers = [whole, *(sizes.get(name, 0) for name in names)]
         return [f"{number:,.0f}" if small else f"{number / 1000:,.1f}" for number in numbers]
 
-    lines = [[str(row.index), row.kind, *cells(row.bytes, row.sizes)] for row in rows[::step]]
-    groups = groups_of(rows)
-    means = [
-        ["mean", name.split()[0], *cells(sum(sizes.values()), sizes)] for name, sizes in groups.items() if name != FIRST
-    ]
     table = compact_table()
     table.padding = 0
     table.title = "packets, bytes" if small else "packets, kB"
@@ -319,11 +314,12 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
     for title in ("frame", "kind", "all", *titles):
         # One word per line, so that titles do not break inside words.
         table.add_column(title.replace(" ", "\n"), justify="left" if title == "kind" else "right", no_wrap=True)
-    for line in lines:
-        table.add_row(*line)
+    for row in rows[::step]:
+        table.add_row(str(row.index), row.kind, *cells(row.bytes, row.sizes))
     table.add_section()
-    for line in means:
-        table.add_row(*line)
+    for name, sizes in groups_of(rows).items():
+        if name != FIRST:
+            table.add_row("mean", name.split()[0], *cells(sum(sizes.values()), sizes))
     return table
 
 

@@ -2,14 +2,11 @@
 """``reconstruct --live``: its options, opening the cameras, the display, and the end of a run."""
 
 import signal
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -20,7 +17,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from structgstream.cli.app import UsageError, usage_errors
+from structgstream.cli.app import StopSignal, UsageError, usage_errors
 from structgstream.cli.options import CaptureOptions, Flag
 from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
 
@@ -96,13 +93,6 @@ def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str]
     return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
 
 
-def stop_of(source: "FrameStream") -> Callable[[], object]:
-    """Ends a run that waits for live cameras; for a recording, does nothing."""
-    from structgstream.data.live.source import LiveSource
-
-    return source.stop if isinstance(source, LiveSource) else lambda: None
-
-
 @contextmanager
 def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> "Iterator[Display]":
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame being fitted."""
@@ -114,30 +104,10 @@ def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int)
             stack.enter_context(metrics.running())
         if isinstance(source, LiveSource) and metrics is not None:
             stack.enter_context(source)
-            stack.enter_context(stop_on_interrupt(lambda: source.stopped, source.stop))
+            stack.enter_context(StopSignal(source.stop, number=signal.SIGINT))
             yield stack.enter_context(live_display(metrics.values, done=done))
         else:
             yield stack.enter_context(display(frame_count(source), done=done))
-
-
-@contextmanager
-def stop_on_interrupt(stopped: Callable[[], bool], stop: Callable[[], object]) -> Iterator[None]:
-    """The first Ctrl-C ends the stream by ``stop`` after the frame being fitted, the second one at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupted(number: int, frame: FrameType | None) -> None:
-        if stopped():
-            raise KeyboardInterrupt
-        stop()
-        print("Ends after this frame; Ctrl-C again ends at once.", file=sys.stderr, flush=True)
-
-    before = signal.signal(signal.SIGINT, interrupted)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 REFRESH = 4  # a second

@@ -9,7 +9,6 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -20,16 +19,11 @@ from structgstream.cli.app import UsageError, usage_errors
 from structgstream.exporters.formats import SUFFIXES
 
 if TYPE_CHECKING:
-    from structgstream.codec.segments.sink import SegmentsOptions
-    from structgstream.codec.segments.store import Store
+    from structgstream.codec.segments.sink import Clocks
     from structgstream.data.source import FrameSource
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
     from structgstream.session.presets import StreamConfig
-
-    Captured = Callable[[int], float | None]
-    SegmentsStorage = Callable[[Captured | None], Storage[Scene]]
-    """Given when frames were filmed, by their number, in seconds since 1970; None where that is not known."""
 
 Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
@@ -274,13 +268,13 @@ class SegmentOptions:
             raise UsageError("--window must be a positive number of seconds, and --keep zero or more.")
 
     def quality_folders(
-        self, output: Path, names: Sequence[str], *, resume: bool, overwrite: bool
-    ) -> "dict[str, SegmentsStorage]":
+        self, output: Path, names: Sequence[str], *, resume: bool, overwrite: bool, clocks: "Clocks | None" = None
+    ) -> "dict[str, Storage[Scene]]":
         """Where each quality of a stream goes, a folder in ``output``, checked before anything takes time."""
         from structgstream.codec.segments.manifest import MANIFEST
         from structgstream.codec.segments.quality_list import read_list
         from structgstream.codec.segments.sink import SegmentsOptions
-        from structgstream.recorder import segments_folder
+        from structgstream.recorder import segments_at, segments_folder
 
         listed = read_list(output)
         if self.sink == "file" or (self.sink is None and listed is None):
@@ -304,25 +298,25 @@ class SegmentOptions:
             )
         stores = {name: segments_folder(output / name, may_exist=resume or overwrite) for name in names}
         options = SegmentsOptions(self.window, self.keep)
-        return {name: partial(_storage, store, options) for name, store in stores.items()}
+        return {name: segments_at(store, options=options, clocks=clocks) for name, store in stores.items()}
 
     @contextmanager
     def storage(
-        self, output: Path, *, may_exist: bool, report: Callable[[str], object]
-    ) -> Iterator["SegmentsStorage | None"]:
+        self, output: Path, *, may_exist: bool, report: Callable[[str], object], clocks: "Clocks | None" = None
+    ) -> Iterator["Storage[Scene] | None"]:
         """Where the stream goes, checked before anything takes time; None for the file ``output``.
 
         The end of the block waits until everything is published; ``report`` gets a sentence if that fails.
         """
         from structgstream.codec.segments.sink import SegmentsOptions
-        from structgstream.recorder import check_output, segments_folder
+        from structgstream.recorder import check_output, segments_at, segments_folder
 
         options = SegmentsOptions(self.window, self.keep)
         if self.chosen(output) == "file":
             check_output(output, may_exist=may_exist)
             yield None
         elif self.publish is None:
-            yield partial(_storage, segments_folder(output, may_exist=may_exist), options)
+            yield segments_at(segments_folder(output, may_exist=may_exist), options=options, clocks=clocks)
         else:
             from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
             from structgstream.codec.segments.store import CloudStore
@@ -339,18 +333,10 @@ class SegmentOptions:
                 pass  # It cannot be reached now; it is claimed as soon as it can be.
             mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
             try:
-                yield partial(_storage, mirror, options)
+                yield segments_at(mirror, options=options, clocks=clocks)
             finally:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     report(
                         f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
                         "program that copies folders, copies them."
                     )
-
-
-def _storage(store: "Store", options: "SegmentsOptions", captured: "Captured | None") -> "Storage[Scene]":
-    from structgstream.codec.segments.sink import Clocks
-    from structgstream.recorder import segments_at
-
-    clocks = Clocks() if captured is None else Clocks(captured=captured)
-    return segments_at(store, options=options, clocks=clocks)

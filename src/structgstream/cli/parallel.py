@@ -236,8 +236,6 @@ WORST_FIRST = ("failed", "running", "ready", "waiting for the track", "done")
 OTHERS = ("running", "ready", "waiting for the track", "failed")
 ROWS = 6
 SHOWN = 8
-FramesOf = Callable[[int, int], int]
-"""Number of fitted frames of a running group."""
 
 
 def cells(states: Sequence["State"], *, width: int) -> Text:
@@ -266,9 +264,10 @@ def counted(status: "Status") -> str:
 
 
 class ParallelDisplay:
-    """Shows the status: all groups, redrawn on a terminal, else lines."""
+    """Shows the status: all groups, redrawn on a terminal, else lines; ``frames_of`` counts the fitted frames of a
+    running group."""
 
-    def __init__(self, console: Console, frames_of: FramesOf) -> None:
+    def __init__(self, console: Console, frames_of: Callable[[int, int], int]) -> None:
         self._console, self._frames_of = console, frames_of
         self._begun = time.monotonic()
         self._live = Live(Text(), console=console, refresh_per_second=2)

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``, also into several qualities."""
 
+import argparse
 import shutil
+import signal
 import sys
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Termination, UsageError, interruption, usage_errors
-from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of, stop_on_interrupt
+from structgstream.cli.app import StopSignal, UsageError, interruption, usage_errors
+from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -31,19 +32,14 @@ from structgstream.cli.options import (
 from structgstream.cli.progress import human_bytes, print_lines
 
 if TYPE_CHECKING:
-    from structgstream.cli.options import Captured
+    from structgstream.codec.segments.sink import Clocks
     from structgstream.data.sound import SoundSource
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
-    from structgstream.recorder import RunMetrics, Storage
+    from structgstream.recorder import Run, RunMetrics, Storage
     from structgstream.scene.scene import Scene
-    from structgstream.session.frame_report import FrameReport
     from structgstream.session.presets import StreamConfig
     from structgstream.training.result import StepListener
-
-    Started = tuple[int, Generator[Any, None, None], Callable[[Any], tuple[FrameReport, str | None, bool]]]
-    """Number of existing frames, reports of the others, and what a report states: frame, quality, and whether all
-    qualities have it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,9 @@ def main(arguments: list[str]) -> None:
     may_exist = options.resume or options.overwrite
     options.segments.chosen(options.output)
     opened = open_scene(options, config, preset=preset, console=console)
-    with options.segments.storage(options.output, may_exist=may_exist, report=partial(print_lines, console)) as storage:
+    with options.segments.storage(
+        options.output, may_exist=may_exist, report=partial(print_lines, console), clocks=opened.clocks
+    ) as storage:
         peaks = run_reconstruction(
             opened.source,
             config,
@@ -142,7 +140,7 @@ def main(arguments: list[str]) -> None:
             metadata=opened.metadata,
             sound=opened.sound,
             resume=options.resume,
-            storage=None if storage is None else storage(opened.captured),
+            storage=storage,
             metrics=run_metrics(opened.source, options.output),
         )
         if peaks:
@@ -156,7 +154,7 @@ class OpenedScene:
     """What a run reads, and with what it computes."""
 
     source: "FrameStream"  # a recording, or live cameras
-    captured: "Captured | None"  # when a frame was filmed, Unix time, by its number; None for a recording
+    clocks: "Clocks | None"  # with the times at which live cameras filmed; None for a recording
     backend: "Backend"
     metadata: Mapping[str, object]  # of the run, for headers
     sound: "SoundSource | None"  # to store beside the frames
@@ -164,6 +162,7 @@ class OpenedScene:
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
+    from structgstream.codec.segments.sink import Clocks
     from structgstream.data.camera_spacing import expectation
     from structgstream.data.roving import roving_of
     from structgstream.evaluation.recording import part_metadata
@@ -182,11 +181,11 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
             denoising=config.denoising,
             sound=options.sound,
         )
-        length, captured, sound = "live", source.captured, source.sound
+        length, clocks, sound = "live", Clocks(captured=source.captured), source.sound
     else:
         options.live.check(options.scene)
         source = open_selected_capture(options.scene, options.capture)
-        length, captured = f"{len(source)} frames", None
+        length, clocks = f"{len(source)} frames", None
         if (roving := roving_of(source)) is not None:
             length = f"{length}; {len(roving.pictures)} roving pictures for frame 0"
         sound = chosen_sound(source, options.scene, options.sound, offset_seconds=options.sound_offset)
@@ -207,7 +206,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     metadata = {"preset": preset, **part}
     if sound is not None:
         print_lines(console, f"Sound: {sound.name}.")
-    return OpenedScene(source, captured, backend, metadata, sound)
+    return OpenedScene(source, clocks, backend, metadata, sound)
 
 
 def run_reconstruction(
@@ -234,8 +233,8 @@ def run_reconstruction(
     from structgstream.recorder import record
     from structgstream.session.struct_gstream import stream_pipeline
 
-    def start(on_step: "StepListener") -> "Started":
-        run = record(
+    def start(on_step: "StepListener") -> "Run":
+        return record(
             output,
             source,
             stream_pipeline(config),
@@ -247,13 +246,12 @@ def run_reconstruction(
             remarks=None if metrics is None else metrics.frame,
             sound=sound,
         )
-        return run.done, run.reports, lambda report: (report, None, True)
 
     return _follow(start, source, output=output, metrics=metrics)
 
 
 def _follow(
-    start: "Callable[[StepListener], Started]",
+    start: "Callable[[StepListener], Run]",
     source: "FrameStream",
     *,
     output: Path,
@@ -264,10 +262,13 @@ def _follow(
 
     Ctrl-C interrupts a recording at once; live cameras and several qualities end after the frame being fitted.
     """
+    from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
 
-    done, stored, read = start(lambda step: progress.step(step))  # progress needs the number of existing frames
-    total, pressed, peaks = frame_count(source), Event(), dict[str, int]()
+    stop = source.stop if isinstance(source, LiveSource) else lambda: None
+    run = start(lambda step: progress.step(step))  # progress needs the number of existing frames
+    done = run.done
+    total, peaks, pressed = frame_count(source), dict[str, int](), StopSignal(number=signal.SIGINT)
 
     def message() -> str:
         if not done and not in_qualities:
@@ -277,12 +278,13 @@ def _follow(
 
     with (
         interruption(message),
-        Termination(on_ask=stop_of(source)) as ending,
+        StopSignal(stop) as ending,
         monitored(source, metrics, done=done) as progress,
-        stop_on_interrupt(pressed.is_set, pressed.set) if in_qualities and total is not None else nullcontext(),
-        closing(stored) as reports,
+        pressed if in_qualities and total is not None else nullcontext(),
+        closing(run.reports) as reports,
     ):
-        for report, quality, whole in map(read, reports):
+        for one in reports:
+            report, quality, whole = (one.report, one.quality, one.whole) if in_qualities else (one, None, True)
             on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
             for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
                 peaks[stage] = max(size, peaks.get(stage, 0))
@@ -290,8 +292,7 @@ def _follow(
             if whole:
                 done = report.index + 1
                 ending.end(whole=done == total)
-                if pressed.is_set() and done != total:
-                    raise KeyboardInterrupt
+                pressed.end(whole=done == total)
         ending.end(whole=done == total)  # Live cameras had nothing to give any more.
         if not done:
             raise KeyboardInterrupt  # They were stopped before frame 0.
@@ -299,14 +300,12 @@ def _follow(
 
 
 def _print_config(arguments: list[str]) -> None:
-    preset = None
-    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
-        if argument == "--preset":
-            if following is None:
-                raise UsageError("--preset needs a name after it, such as --preset fast.")
-            preset = following
-        elif argument.startswith("--preset="):
-            preset = argument.removeprefix("--preset=")
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset")
+    try:
+        preset = parser.parse_known_args(arguments)[0].preset
+    except argparse.ArgumentError:
+        raise UsageError("--preset needs a name after it, such as --preset fast.") from None
     config, name = resolve_config(preset, [], command="reconstruct", seed=None)
     print(f"Each field of the configuration is an option of reconstruct; values are those of the preset {name!r}.\n")
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
@@ -328,26 +327,25 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
             configured(config, quality)
     console, names = Console(), [quality.name for quality in qualities]
     opened = open_scene(options, config, preset=preset, console=console)
-    folders = options.segments.quality_folders(
-        options.output, names, resume=options.resume, overwrite=options.overwrite
+    storages = options.segments.quality_folders(
+        options.output, names, resume=options.resume, overwrite=options.overwrite, clocks=opened.clocks
     )
     metrics = run_metrics(opened.source, options.output, qualities=names)
 
-    def start(on_step: "StepListener") -> "Started":
-        run = record_qualities(
+    def start(on_step: "StepListener") -> "Run":
+        return record_qualities(
             options.output,
             opened.source,
             config,
             qualities,
             opened.backend,
-            storages={name: storage(opened.captured) for name, storage in folders.items()},
+            storages=storages,
             resume=options.resume,
             metadata=opened.metadata,
             on_step=on_step,
             metrics=metrics,
             sound=opened.sound,
         )
-        return run.done, run.reports, lambda one: (one.report, one.quality, one.whole)
 
     _follow(start, opened.source, output=options.output, metrics=metrics, in_qualities=True)
     print_lines(console, f"Wrote {options.output}: {', '.join(names)}")

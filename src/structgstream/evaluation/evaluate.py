@@ -71,43 +71,24 @@ def halved(camera: Camera) -> Camera:
 def half_scores(
     scene: Drawable, camera: Camera, truth: Picture, *, backend: Backend, mask: Mask | None = None
 ) -> dict[str, float | None]:
-    """PSNR and SSIM, by their names in ``Scores``, of a rendering by ``camera`` (:func:`halved`, scene units) against
+    """PSNR and SSIM, by their names in ``Scores``, of a rendering at half the size of ``camera`` (scene units) against
     the area mean of the truth ``[H, W, 3]``, which is black outside ``mask`` ``[H, W]``, the pixels that count."""
     small = None if mask is None else block_mask(mask, 2)
-    return _psnr_and_ssim(scene, camera, block_means(truth, 2), small, backend, size="half")
+    return _psnr_and_ssim(scene, halved(camera), block_means(truth, 2), small, backend, size="half")
 
 
-@dataclass
-class StoredSize:
-    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from."""
-
-    source: FrameSource  # the capture at that size, the same frames
-    views: Mapping[str, Camera]  # cameras of the stream by name, scene units
-    backend: Backend
-    frames: frozenset[int]  # numbers of the scored frames
-    _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
-
-    def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:
-        """PSNR and SSIM by their names in ``Scores``; empty for frames that are not scored. Raises CaptureError if the
-        stored picture does not exist any more."""
-        if index not in self.frames:
-            return {}
-        if self._frame is None or self._frame[0] != index:
-            self._frame = index, next(self.source.frames(index))
-        truth, mask = self._frame[1].images.get(camera), self._frame[1].masks.get(camera)
-        if truth is None:
-            raise CaptureError(
-                f"The stored picture of camera {camera!r} in frame {index} of {self.source.name} has gone."
-            )
-        view = self.views[camera].resized(truth.shape[1], truth.shape[0])
-        return _psnr_and_ssim(scene, view, blackened(truth, mask), mask, self.backend, size="stored")
+def stored_scores(
+    scene: Drawable, camera: Camera, truth: Picture, *, backend: Backend, mask: Mask | None = None
+) -> dict[str, float | None]:
+    """The same at the size of a stored picture ``[H, W, 3]``, which is larger than that of ``camera``."""
+    view = camera.resized(truth.shape[1], truth.shape[0])
+    return _psnr_and_ssim(scene, view, blackened(truth, mask), mask, backend, size="stored")
 
 
-def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Backend, frames: int) -> StoredSize:
-    """Scores at the size of ``source``, for evenly spread frames among the first ``frames``."""
+def frames_at_stored_size(frames: int) -> list[int]:
+    """The evenly spread frames, of so many, that are scored at the size of the stored pictures."""
     count = max(1, min(STORED_FRAMES, frames // STORED_SHARE))
-    chosen = frozenset(spread_indices(frames, count) if count > 1 else [frames - 1])
-    return StoredSize(select_cameras(source, tuple(views)), views, backend, chosen)
+    return spread_indices(frames, count) if count > 1 else [frames - 1]
 
 
 def _psnr_and_ssim(
@@ -180,15 +161,16 @@ def evaluate(
         )
     size = len(recording.packets)
     selected = select_cameras(source, names)
-    large = None if stored is None else stored_size(stored, views, backend=backend, frames=size)
-    comparison = _Comparison(views, backend, optional_metrics, GhostSearch(selected, names, size), large)
+    large = None if stored is None else select_cameras(stored, names)
+    in_large = [] if large is None else frames_at_stored_size(size)
+    comparison = _Comparison(views, backend, optional_metrics, GhostSearch(selected, names, size))
     frames = []
     peaks = PeakMeter(backend.device)
     for frame, (info, scene, decode_seconds) in zip(selected.frames(), decoded(recording, backend.device)):
         compared = []
+        stored_frame = next(large.frames(info.index)) if large is not None and info.index in in_large else None
         for name in frame.present(names):
-            truth, mask = frame.images[name], frame.masks.get(name)
-            compared.append(comparison.compare(name, scene, truth, index=info.index, mask=mask))
+            compared.append(comparison.compare(name, scene, frame, index=info.index, stored=stored_frame))
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
@@ -205,7 +187,7 @@ def evaluate(
     facts |= left_out
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"worst": worst_facts(frames)}
-    facts |= {"stored_size_frames": sorted(large.frames) if large is not None else []}
+    facts |= {"stored_size_frames": in_large}
     facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
     facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, left_out["masked_share"])}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
@@ -222,8 +204,6 @@ class _Comparison:
     backend: Backend
     optional_metrics: OptionalMetrics | None  # the metrics that take longer; None for none
     ghosts: GhostSearch  # finds ghosts
-    large: StoredSize | None  # scores at the size of the stored pictures; None for none
-    halves: dict[str, Camera] = field(default_factory=dict, init=False)
     # each camera's first picture, and its mask
     first: dict[str, tuple[Picture, Mask | None]] = field(default_factory=dict)
     colors: dict[str, ChannelFit] = field(default_factory=dict)  # each camera's colour response, fitted to frame 0
@@ -232,13 +212,15 @@ class _Comparison:
     left_out: dict[str, list[float]] = field(default_factory=dict)  # each camera's share of masked pixels, by frame
 
     def compare(
-        self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None = None
+        self, camera: str, scene: Drawable, frame: MultiViewFrame, *, index: int, stored: MultiViewFrame | None
     ) -> Compared:
-        """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of ``mask``.
+        """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of the camera's mask; also at
+        the size of a ``stored`` frame.
 
         Both pictures are black in the other pixels, so that these do not affect the scores of their neighbours.
         """
-        truth = blackened(truth, mask)
+        mask = frame.masks.get(camera)
+        truth = blackened(frame.images[camera], mask)
         first, first_mask = self.first.setdefault(camera, (truth, mask))
         picture, seconds = rendered(scene, self.views[camera], self.backend)
         picture = blackened(picture, mask)
@@ -255,7 +237,12 @@ class _Comparison:
             first_mask=first_mask,
         )
         ghosts = self.ghosts.find(camera, picture, truth, index=index, mask=mask)
-        scores = replace(scores, **self._at_other_sizes(camera, scene, truth, index=index, mask=mask))
+        view, backend = self.views[camera], self.backend
+        if min(truth.shape[:2]) > 1:
+            scores = replace(scores, **half_scores(scene, view, truth, backend=backend, mask=mask))
+        if stored is not None and camera in stored.images:
+            large, large_mask = stored.images[camera], stored.masks.get(camera)
+            scores = replace(scores, **stored_scores(scene, view, large, backend=backend, mask=large_mask))
         if ghosts is not None:
             scores = replace(
                 scores,
@@ -276,16 +263,6 @@ class _Comparison:
             self.before[camera] = index, now
             scores = replace(scores, **further)
         return Compared(camera, truth, picture, scores, first, both(mask, first_mask), ghosts)
-
-    def _at_other_sizes(
-        self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None
-    ) -> dict[str, float | None]:
-        if min(truth.shape[:2]) < 2:
-            return {}
-        if camera not in self.halves:
-            self.halves[camera] = halved(self.views[camera])
-        scores = half_scores(scene, self.halves[camera], truth, backend=self.backend, mask=mask)
-        return scores if self.large is None else scores | self.large.scores(camera, scene, index=index)
 
 
 def _not_available(metrics: OptionalMetrics | None, masked_share: Mapping[str, float]) -> dict[str, str]:

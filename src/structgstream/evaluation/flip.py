@@ -22,6 +22,8 @@ PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * np.pi / 180  # seen from 0.7 m, a displ
 # for luminance, red to green and blue to yellow (table 1 of the paper).
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 COLOR_EXPONENT, KNEE, KNEE_ERROR = 0.7, 0.4, 0.95  # q_c, p_c, p_t of the paper
+# Hunt-adjusted difference of pure green and pure blue, the largest of a display, to the power of COLOR_EXPONENT.
+LARGEST_COLOR_DIFFERENCE = 41.2766020417559
 FEATURE_DEGREES = 0.082  # width of the detected edges and points
 FEATURE_EXPONENT = 0.5
 
@@ -66,8 +68,7 @@ def flip_map(one: FlipFeatures, other: FlipFeatures) -> Plane:
     light, *hues = (cv2.absdiff(a, b) for a, b in zip(one.color, other.color, strict=True))
     light += _length(hues[0], hues[1])
     color = cv2.pow(light, COLOR_EXPONENT, dst=light)
-    largest = _largest_color_difference()
-    knee = KNEE * largest
+    largest, knee = LARGEST_COLOR_DIFFERENCE, KNEE * LARGEST_COLOR_DIFFERENCE
     # Both lines pass through the knee, and the second is less steep.
     above = (1 - KNEE_ERROR) / (largest - knee)
     second = color * np.float32(above)
@@ -154,16 +155,3 @@ def _length(x: Plane, y: Plane) -> Plane:
     y *= y
     x += y
     return np.sqrt(x, out=x)
-
-
-def _largest_color_difference() -> float:
-    """Colour difference of pure green and pure blue, the largest on a display, raised to :data:`COLOR_EXPONENT`."""
-    green, blue = (_hunt_adjusted(color) for color in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])))
-    return float((abs(green[0] - blue[0]) + np.hypot(*(green - blue)[1:])) ** COLOR_EXPONENT)
-
-
-def _hunt_adjusted(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    xyz = TO_XYZ @ linear
-    root = np.where(xyz > DELTA**3, np.cbrt(xyz), xyz / (3 * DELTA**2) + 4 / 29)
-    light, red, yellow = TO_LAB[:, :3] @ root + TO_LAB[:, 3]
-    return np.array([light, 0.01 * light * red, 0.01 * light * yellow])

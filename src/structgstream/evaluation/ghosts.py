@@ -11,20 +11,12 @@ displaced outlines. Large pictures are reduced first, so that size does not chan
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.data.source import FrameSource, every_nth_frame, section
-from structgstream.evaluation.metrics import (
-    Mask,
-    Picture,
-    blackened,
-    differing,
-    dilate,
-    psnr,
-)
+from structgstream.evaluation.metrics import Mask, Picture, blackened, differing, dilate, psnr
 from structgstream.evaluation.pictures import block_mask, block_means
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
@@ -60,41 +52,31 @@ class Ghosts:
         return int(np.count_nonzero(self.ghosts)) / count if count else None
 
 
-@dataclass
 class GhostFinder:
-    """Finds one camera's ghosts, frame by frame."""
+    """Finds one camera's ghosts, frame by frame; its pictures are reduced. After ``memory`` frames an occupied pixel
+    can no longer become a ghost."""
 
-    memory: int  # number of frames after which an occupied pixel can no longer become a ghost
-    background: Picture | None = None  # the present one, reduced; None before the first
-    # [h, w] number of the last frame in which the pixel, or one near it, was occupied
-    occupied: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 0), np.int32))
-    # reduced truth of each pixel when it was last occupied; the background for pixels that never were
-    left: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
-    # reduced rendering of each pixel when it was last not occupied
-    before: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
-    # [h, w] mask of the pixels with a value in before
-    seen: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
-    # [h, w] mask of the last picture's ghosts among the pixels of seen
-    stuck: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
+    def __init__(self, background: Picture, memory: int) -> None:
+        shape = background.shape[:2]
+        self.background, self.memory = background, memory
+        # [h, w] number of the last frame in which the pixel, or one near it, was occupied
+        self.occupied = np.full(shape, NEVER, np.int32)
+        self.left = background  # truth of each pixel when it was last occupied; the background where it never was
+        self.before = background  # rendering of each pixel when it was last not occupied
+        self.seen = np.zeros(shape, np.bool_)  # [h, w] mask of the pixels with a value in before
+        self.stuck = np.zeros(shape, np.bool_)  # [h, w] mask of the last picture's ghosts among the pixels of seen
 
-    def begin(self, background: Picture) -> None:
-        """Set another background, reduced; pixels where it differs from the last one are reset."""
-        if self.background is None:
-            shape = background.shape[:2]
-            self.occupied = np.full(shape, NEVER, np.int32)
-            self.left = self.before = background
-            self.seen, self.stuck = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-        else:
-            other = differing(background, self.background, RESTORED)
-            self.occupied[other] = NEVER
-            self.left = np.where(other[..., None], background, self.left)
-            self.seen, self.stuck = self.seen & ~other, self.stuck & ~other
+    def replace_background(self, background: Picture) -> None:
+        """Set another background; pixels where it differs from the last one are reset."""
+        other = differing(background, self.background, RESTORED)
+        self.occupied[other] = NEVER
+        self.left = np.where(other[..., None], background, self.left)
+        self.seen, self.stuck = self.seen & ~other, self.stuck & ~other
         self.background = background
 
     def find(self, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None) -> Ghosts:
-        """The ghosts of the rendering ``[H, W, 3]`` of frame ``index`` in the pixels ``[H, W]`` that count; call
-        :meth:`begin` first, then this in order of frames."""
-        assert self.background is not None
+        """The ghosts of the rendering ``[H, W, 3]`` of frame ``index`` in the pixels ``[H, W]`` that count; called in
+        order of frames."""
         factor = reduction(truth)
         drawn, true = block_means(picture, factor), block_means(truth, factor)
         counting = None if mask is None else ~dilate(~block_mask(mask, factor), 1)
@@ -143,30 +125,29 @@ def reduction(picture: Picture) -> int:
     return max(1, max(picture.shape[:2]) // SIDE)
 
 
-@dataclass
 class GhostSearch:
-    """The ghosts of several cameras, with the backgrounds that they need, section by section."""
+    """The ghosts of several cameras over ``frames`` frames. The capture is read again for their backgrounds, section by
+    section."""
 
-    source: FrameSource  # the capture, which is read again for the backgrounds
-    names: tuple[str, ...]  # names of the cameras
-    frames: int  # number of frames that are scored
-    finders: dict[str, GhostFinder] = field(default_factory=dict)  # finder of each camera
-    ends: int = 0  # number of the first frame of the next section
-
-    def __post_init__(self) -> None:
-        memory = max(round(MEMORY_SECONDS * self.source.fps), MEMORY_FRAMES)
-        self.finders = {name: GhostFinder(memory) for name in self.names}
+    def __init__(self, source: FrameSource, names: tuple[str, ...], frames: int) -> None:
+        self.source, self.names, self.frames = source, names, frames
+        self.finders: dict[str, GhostFinder] = {}  # of the cameras whose background is known
+        self.ends = 0  # number of the first frame of the next section
 
     def find(
         self, camera: str, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None
     ) -> Ghosts | None:
-        """See :meth:`GhostFinder.find`; None for a camera without any picture in this section's background."""
+        """See :meth:`GhostFinder.find`; None for a camera without any picture so far."""
         if index >= self.ends:
             first, self.ends = next(one for one in sections(self.frames, self.source.fps) if one[1] > index)
             for name, background in backgrounds(self.source, self.names, first=first, end=self.ends).items():
-                self.finders[name].begin(background)
-        finder = self.finders[camera]
-        return None if finder.background is None else finder.find(picture, truth, index=index, mask=mask)
+                if name in self.finders:
+                    self.finders[name].replace_background(background)
+                else:
+                    memory = max(round(MEMORY_SECONDS * self.source.fps), MEMORY_FRAMES)
+                    self.finders[name] = GhostFinder(background, memory)
+        finder = self.finders.get(camera)
+        return None if finder is None else finder.find(picture, truth, index=index, mask=mask)
 
 
 def sections(frames: int, fps: float) -> Iterator[tuple[int, int]]:

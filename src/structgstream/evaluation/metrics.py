@@ -32,6 +32,7 @@ from structgstream.cameras import enlargement
 from structgstream.errors import CaptureError
 from structgstream.evaluation.report import Scores
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.reference_losses import C1, C2, WINDOW_PIXELS, ssim_map, window
 
 Picture = NDArray[np.uint8]
 """``[H, W, 3]`` sRGB."""
@@ -98,10 +99,8 @@ def _dilate_down(mask: Mask, pixels: int) -> Mask:
 
 
 PSNR_OF_EQUALS = 100.0  # dB; above any PSNR of different 8-bit pictures, and representable in JSON
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # exponents of MS-SSIM, finest first
-SMALLEST_OF_SCALES = (WINDOW - 1) * 2 ** (len(SCALES) - 1) + 1  # pixels: the window fits five times halved pictures
+SMALLEST_OF_SCALES = (WINDOW_PIXELS - 1) * 2 ** (len(SCALES) - 1) + 1  # pixels: the window fits at the coarsest scale
 
 
 def squared_errors(picture: Picture, truth: Picture) -> NDArray[np.int32]:
@@ -127,29 +126,12 @@ def psnr(picture: Picture, truth: Picture, mask: Mask | None = None) -> float:
     return psnr_of(errors if mask is None else errors[mask])
 
 
-def ssim_map(picture: Picture, truth: Picture) -> Tensor:
-    """Structural similarity of every pixel and channel, ``[3, H, W]`` (Wang et al., 2004).
-
-    Gaussian window of 11 pixels, sigma 1.5; K1 = 0.01, K2 = 0.03, weighted (biased) moments, zeros beyond the
-    border.
-    """
-    luminance, structure = _similarity(*_channels(picture, truth), padding=WINDOW // 2)
-    return luminance * structure
-
-
-def _channels(*pictures: Picture) -> tuple[Tensor, ...]:
-    """8-bit pictures as ``[3, H, W]`` in [0, 1]."""
-    return tuple(torch.from_numpy(np.ascontiguousarray(p)).permute(2, 0, 1) / 255.0 for p in pictures)
-
-
-def _similarity(a: Tensor, b: Tensor, *, padding: int) -> tuple[Tensor, Tensor]:
-    """Luminance, and contrast times structure, of every window of two ``[3, H, W]`` with a border of zeros."""
-    offsets = torch.arange(WINDOW, dtype=torch.float32) - WINDOW // 2
-    kernel = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    kernel = (kernel / kernel.sum()).expand(15, 1, WINDOW).to(a.device)
+def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance, and contrast times structure, of every window that lies in two pictures ``[3, H, W]``."""
+    kernel = window(a).expand(15, 1, WINDOW_PIXELS)
     moments = torch.cat([a, b, a * a, b * b, a * b])[None]  # [1, 15, H, W]
-    moments = conv2d(moments, kernel[:, :, None, :], padding=(0, padding), groups=15)
-    moments = conv2d(moments, kernel[:, :, :, None], padding=(padding, 0), groups=15)
+    moments = conv2d(moments, kernel[:, :, None, :], groups=15)
+    moments = conv2d(moments, kernel[:, :, :, None], groups=15)
     mean_a, mean_b, square_a, square_b, product = moments[0].unflatten(0, (5, 3))
     variances = square_a - mean_a**2 + square_b - mean_b**2
     covariance = product - mean_a * mean_b
@@ -160,16 +142,16 @@ def _similarity(a: Tensor, b: Tensor, *, padding: int) -> tuple[Tensor, Tensor]:
 def ms_ssim(picture: Picture, truth: Picture) -> float | None:
     """Structural similarity over five scales (Wang et al., 2003), averaged over channels; None for small pictures.
 
-    Windows and constants as in :func:`ssim_map`, without padding. Each scale averages 2x2 pixels of the one before; an
+    Windows and constants as in :func:`ssim`, without padding. Each scale averages 2x2 pixels of the one before; an
     odd side is padded with a line of zeros at its start, as in pytorch-msssim. The result is the product over scales of
     the mean of contrast times structure (at the coarsest scale of SSIM), clamped at 0, to the power of its weight.
     """
     if min(truth.shape[:2]) < SMALLEST_OF_SCALES:
         return None
-    a, b = _channels(picture, truth)
+    a, b = (torch.from_numpy(np.ascontiguousarray(p)).permute(2, 0, 1) / 255.0 for p in (picture, truth))
     product = torch.ones(3)
     for scale, weight in enumerate(SCALES):
-        luminance, structure = _similarity(a, b, padding=0)
+        luminance, structure = _similarity(a, b)
         last = scale == len(SCALES) - 1
         product *= (luminance * structure if last else structure).mean((1, 2)).relu() ** weight
         odd = a.shape[1] % 2, a.shape[2] % 2
@@ -178,16 +160,16 @@ def ms_ssim(picture: Picture, truth: Picture) -> float | None:
 
 
 def ssim(picture: Picture, truth: Picture, backend: Backend, mask: Mask | None = None) -> float:
-    """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
+    """Mean structural similarity over pixels and channels (Wang et al., 2004), as Gaussian splatting papers report it:
+    with zeros beyond the border (``kernels/reference_losses.py``).
 
     On real pictures all back-ends agree within 1e-5; the C++ one is the nearest to float64. With a ``mask`` ``[H, W]``
     the mean is over its pixels. Both pictures are black in the others, which therefore count as beyond the border.
     """
-    if mask is not None:
-        return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
-    device = backend.device
-    image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))
+    image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(backend.device) for p in (picture, truth))
     with torch.no_grad():
+        if mask is not None:
+            return float(ssim_map(image / 255.0, target / 255.0)[torch.from_numpy(mask).to(backend.device)].mean())
         return float(backend.l1_ssim(image / 255.0, target)[1])
 
 

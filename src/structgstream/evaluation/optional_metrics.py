@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics with requirements: an optional package, weights, or the previous frame.
+"""Metrics with requirements: OpenCV, weights, the size of pictures, or the previous frame.
 
-If a requirement is missing, the metric is None, and the reason and its remedy are reported once. Temporal metrics
-compare consecutive frames of one camera by the optical flow between them.
+Without OpenCV there are none of them. If another requirement is missing, the metric is None, and the reason and its
+remedy are reported once. Temporal metrics compare consecutive frames of one camera by the optical flow between them.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -15,41 +15,25 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
 from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, Mask, Picture, both, changed_pixels, ms_ssim
 from structgstream.flow import FlowSearch, consistency_mask, dis_search, sampled
 
 
-@dataclass(frozen=True)
-class FlowField:
-    """Backward flow of one frame."""
-
-    # [H, W, 2] float32, x and y in pixels: pixel p was at p + offsets[p] in the frame before
-    offsets: NDArray[np.float32]
-    seen: Mask  # [H, W] mask of the pixels that were not occluded in the frame before
-
-
-def flow_field(search: FlowSearch, before: Picture, now: Picture) -> FlowField:
-    """The flow between the truth of two frames, searched in both directions; consistent pixels
-    (``flow.consistency_mask``) count as seen."""
-    backward = search(now, before)
-    return FlowField(backward, consistency_mask(backward, search(before, now)))
-
-
-def warping_error(now: Picture, before: Picture, field: FlowField) -> float | None:
+def warping_error(now: Picture, before: Picture, backward: NDArray[np.float32], seen: Mask) -> float | None:
     """E_warp of one pair: the mean squared difference of a rendering and the warped previous rendering.
 
-    ``before`` is warped by the truth's backward flow; the mean is over channels and over the pixels that were not
-    occluded. Pictures are ``[H, W, 3]`` uint8, full scale 1. None if all pixels were occluded.
+    ``before`` is warped by the truth's flow ``backward`` ``[H, W, 2]``, x and y in pixels: pixel p was at
+    ``p + backward[p]`` in the frame before. The mean is over channels and over the pixels ``seen`` ``[H, W]``, which
+    were not occluded. Pictures are ``[H, W, 3]`` uint8, full scale 1. None if all pixels were occluded.
 
     Source: Lai et al., 2018, whose sum over channels is a mean here.
     """
-    if not field.seen.any():
+    if not seen.any():
         return None
-    carried = sampled(before.astype(np.float32), field.offsets)
-    squares = np.square(carried - now)[field.seen]
+    carried = sampled(before.astype(np.float32), backward)
+    squares = np.square(carried - now)[seen]
     return float(squares.mean(dtype=np.float64)) / 255.0**2
 
 
@@ -77,7 +61,7 @@ TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 class OptionalMetrics:
     """The available metrics, and the reasons for missing ones."""
 
-    search: FlowSearch | None  # finds optical flow; None without OpenCV, which FLIP needs, too
+    search: FlowSearch  # finds optical flow
     lpips: Mapping[str, Lpips]  # the trunks whose weights were found, by name
     weights: Mapping[str, str] = field(default_factory=dict)  # the file of each trunk's weights, by name of the trunk
     not_available: Mapping[str, str] = field(default_factory=dict)  # the reason for each missing metric
@@ -87,12 +71,12 @@ class OptionalMetrics:
 class ComparedFrame:
     """One camera's frame, stored for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
 
-    Each pair is of truth and rendering, or None if that metric is not computed. Only the pixels of ``mask`` count.
+    Each pair is of truth and rendering; None without LPIPS. Only the pixels of ``mask`` count.
     """
 
     truth: Picture
     picture: Picture
-    flip: tuple[FlipFeatures, FlipFeatures] | None
+    flip: tuple[FlipFeatures, FlipFeatures]
     lpips: tuple[Features, Features] | None
     mask: Mask | None = None
 
@@ -101,13 +85,9 @@ def load_optional_metrics(
     cameras: Iterable[tuple[str, Camera]], *, frames: int, device: torch.device, lpips_weights: Path | None = None
 ) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames: pictures must be large
-    enough, and temporal metrics need two frames. Raises ConfigError if a file of weights is invalid."""
+    enough, and temporal metrics need two frames. Raises ConfigError if a file of weights is invalid, MissingExtraError
+    without OpenCV."""
     missing: dict[str, str] = {}
-    search = None
-    try:
-        search = dis_search("eval")
-    except MissingExtraError as error:
-        missing |= dict.fromkeys(("flip", "temporal_flip", "e_warp"), str(error))
     sides = {name: min(camera.width, camera.height) for name, camera in cameras}
     found: dict[str, Lpips] = {}
     weights: dict[str, str] = {}
@@ -124,7 +104,7 @@ def load_optional_metrics(
         missing["ms_ssim"] = reason
     if frames < 2:
         missing |= dict.fromkeys(TEMPORAL, "the stream has one frame, and this score compares two")
-    return OptionalMetrics(search, found, weights, missing)
+    return OptionalMetrics(dis_search("eval"), found, weights, missing)
 
 
 def optional_scores(
@@ -146,8 +126,8 @@ def optional_scores(
     """
     alex, vgg = (None if mask is not None else _usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
     scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth) if mask is None else None}
-    seen = None if optional_metrics.search is None else (features_of(truth), features_of(picture))
-    scores["flip"] = None if seen is None else flip_of(*seen, mask=mask)
+    flip = features_of(truth), features_of(picture)
+    scores["flip"] = flip_of(*flip, mask=mask)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
     scores["lpips_vgg"] = None if vgg is None else vgg.distance(vgg.features(truth), vgg.features(picture))
@@ -157,24 +137,25 @@ def optional_scores(
         still = still if counting is None else still & counting
         scores["flicker"] = flicker(picture, before.picture, still)
         scores["truth_flicker"] = flicker(truth, before.truth, still)
-        if optional_metrics.search is not None:
-            field = _counting(flow_field(optional_metrics.search, before.truth, truth), mask, before.mask)
-            scores["e_warp"] = warping_error(picture, before.picture, field)
-        if seen is not None and before.flip is not None and counting is None:
-            true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
+        backward = optional_metrics.search(truth, before.truth)
+        seen = consistency_mask(backward, optional_metrics.search(before.truth, truth))
+        seen = _counting(seen, backward, mask, before.mask)
+        scores["e_warp"] = warping_error(picture, before.picture, backward, seen)
+        if counting is None:
+            true, rendered = (flip_of(*pair) for pair in zip(flip, before.flip, strict=True))
             scores["temporal_flip"] = abs(rendered - true)
         if alex is not None and features is not None and before.lpips is not None:
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = abs(rendered - true)  # tLP of Chu et al., 2020
-    return scores, ComparedFrame(truth, picture, seen, features, mask)
+    return scores, ComparedFrame(truth, picture, flip, features, mask)
 
 
-def _counting(field: FlowField, mask: Mask | None, before: Mask | None) -> FlowField:
-    """``field`` restricted to pixels that count in this frame and whose sources counted in the frame before."""
-    seen = field.seen if mask is None else field.seen & mask
-    if before is not None:
-        seen = seen & (sampled(before.astype(np.float32)[..., None].repeat(3, axis=2), field.offsets)[..., 0] > 0.999)
-    return replace(field, seen=seen)
+def _counting(seen: Mask, backward: NDArray[np.float32], mask: Mask | None, before: Mask | None) -> Mask:
+    """``seen`` restricted to pixels that count in this frame and whose sources counted in the frame before."""
+    seen = seen if mask is None else seen & mask
+    if before is None:
+        return seen
+    return seen & (sampled(before.astype(np.float32)[..., None], backward)[..., 0] > 0.999)
 
 
 def _usable(optional_metrics: OptionalMetrics, name: str, picture: Picture) -> Lpips | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from structgstream.atomic_files import atomic_write
 from structgstream.evaluation.metrics import Mask, Picture
-from structgstream.figure import figure_of
+from structgstream.figure import figure_of, save_figure
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 RGB, FILTER_UP = 2, 2
@@ -128,8 +128,7 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
                 figure.figimage(cell[row], x, y, origin="upper")
             top += heights[name] + GAP
         top += LABEL // 2
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path)
 
 
 def _tiles(cells: Mapping[int, tuple[Picture, Picture]]) -> Mapping[int, tuple[Picture, Picture, Picture]]:

@@ -2,6 +2,7 @@
 """Plots of a report over time, in one picture: quality, bytes, counts, seconds."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +28,9 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
         MissingExtraError: matplotlib is not installed.
     """
     panels: list[Callable[[Axes, Report], None]] = [_quality]
-    for panel, lines in ((_distances, DISTANCES), (_flicker, FLICKER)):
+    for lines, label in ((DISTANCES, "distance"), (FLICKER, "flicker, levels")):
         if any(_known(report, key) for key, _ in lines):
-            panels.append(panel)
+            panels.append(partial(_lines, keys=lines, label=label))
     if _known(report, "ghost_share"):
         panels.append(_ghosts)
     panels += [_bytes, _counts]
@@ -65,16 +66,6 @@ def _quality(axis: "Axes", report: Report) -> None:
     axis.set_ylabel("PSNR, dB", fontsize=9)
 
 
-def _distances(axis: "Axes", report: Report) -> None:
-    _lines(axis, report, DISTANCES)
-    axis.set_ylabel("distance", fontsize=9)
-
-
-def _flicker(axis: "Axes", report: Report) -> None:
-    _lines(axis, report, FLICKER)
-    axis.set_ylabel("flicker, levels", fontsize=9)
-
-
 def _ghosts(axis: "Axes", report: Report) -> None:
     for colour, name in zip(cycle(COLORS), report.cameras):
         pairs = [(frame.index, frame.cameras[name].ghost_share) for frame in report.frames if name in frame.cameras]
@@ -87,14 +78,15 @@ def _ghosts(axis: "Axes", report: Report) -> None:
     axis.set_ylabel("ghosts, % of disoccluded", fontsize=9)
 
 
-def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:
+def _lines(axis: "Axes", report: Report, *, keys: Sequence[tuple[str, str]], label: str) -> None:
     """Plots the mean over cameras of metrics whose best value is 0, each always in the same colour."""
     largest = 0.0
-    for colour, (key, label) in zip(COLORS, keys):
+    for colour, (key, name) in zip(COLORS, keys):
         if points := _known(report, key):
-            axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
+            axis.plot(*zip(*points), color=colour, linewidth=1.5, label=name)
             largest = max(largest, *(value for _, value in points))
     axis.set_ylim(0, 1.1 * largest or None)  # Automatic margins of nearly constant values would cut the line.
+    axis.set_ylabel(label, fontsize=9)
 
 
 def _known(report: Report, key: str) -> list[tuple[int, float]]:

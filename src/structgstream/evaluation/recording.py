@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -23,19 +23,12 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 
 
-@runtime_checkable
-class Movable(Drawable, Protocol):
-    """A drawable whose tensors can be moved to another device."""
-
-    def on_device(self, device: torch.device) -> Drawable: ...
-
-
 class Recording(Protocol):
     """An opened file with one packet per frame, such as a ``StreamReader``.
 
     ``scenes`` decodes a drawable in normalised units frame by frame. ``complete`` states whether the run that wrote the
-    file finished. The length of a drawable other than a ``Scene`` is its number of Gaussians. It needs ``on_device``
-    (:class:`Movable`) to be drawn on another device than the CPU.
+    file finished. The length of a drawable other than a ``Scene`` is its number of Gaussians. To be drawn on another
+    device than the CPU, it needs a function ``on_device`` that returns its copy there.
     """
 
     @property
@@ -62,9 +55,10 @@ def to_device(drawable: Drawable, device: torch.device) -> Drawable:
         return on_device(drawable, device)
     if device.type == "cpu":
         return drawable
-    if not isinstance(drawable, Movable):
+    moved = getattr(drawable, "on_device", None)
+    if moved is None:
         raise BackendError(f"A {type(drawable).__name__} cannot be drawn on {device}; choose --device cpu.")
-    return drawable.on_device(device)
+    return moved(device)
 
 
 def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
