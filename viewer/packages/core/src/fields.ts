@@ -29,14 +29,14 @@ export type FieldName = (typeof FIELD_TABLE)[number][0];
 export const FIELD_NAMES: readonly FieldName[] = FIELD_TABLE.map(([name]) => name);
 
 /** Optional fields; a scene has both of the first two or neither. */
-const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
+export const OPTIONAL_FIELDS: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
 
 /** Rows of an environment: spherical harmonics up to degree 0, 1 and 2. */
 const ENVIRONMENT_ROWS: readonly number[] = [1, 4, 9];
 
 /** Whether these are the fields of a scene. */
 export function isScene(names: ReadonlySet<FieldName>): boolean {
-  const whole = FIELD_NAMES.every((name) => names.has(name) || OPTIONAL.includes(name));
+  const whole = FIELD_NAMES.every((name) => names.has(name) || OPTIONAL_FIELDS.includes(name));
   return whole && names.has("appearance") === names.has("appearance_basis");
 }
 

@@ -1,7 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The scene in the renderer: its present state, and the state for which an order was requested. */
 
-import { FIELD_NAMES, type FieldName, type Fields, type StreamHeader, type Tensor } from "@structgstream/core";
+import {
+  FIELD_NAMES,
+  type FieldName,
+  type Fields,
+  OPTIONAL_FIELDS,
+  type StreamHeader,
+  type Tensor,
+} from "@structgstream/core";
 import { GlError } from "./errors.js";
 import { type TrainingCameras, trainingCamerasOf } from "./sampling.js";
 import type { SceneUpdate } from "./types.js";
@@ -30,8 +37,6 @@ export interface Shape {
   readonly hidden: number;
   readonly distanceInput: boolean;
 }
-
-const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
 
 export function sizesOf(fields: Fields): Sizes {
   const [anchors, offsetsPerAnchor] = fields.get("anchor_offsets")!.shape as [number, number];
@@ -75,7 +80,7 @@ export class LiveScene {
   /** @throws GlError the update lacks fields that no earlier update contained */
   apply(update: SceneUpdate): void {
     const fields = new Map([...this.fields, ...update.fields]);
-    const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL.includes(name));
+    const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL_FIELDS.includes(name));
     if (missing.length) {
       throw new GlError(
         `The update of frame ${update.index} lacks ${missing.join(", ")}; expected every dynamic field in the first update.`,
