@@ -6,9 +6,9 @@ import {
   type Camera,
   center,
   fitted,
-  type Renderer,
   type RenderStats,
   type ResourceCounts,
+  type SplatRenderer,
   type Views,
 } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
@@ -37,7 +37,7 @@ export interface HeadsetViews extends Views {
 }
 
 export interface PlayerOptions {
-  readonly renderer: Renderer;
+  readonly renderer: SplatRenderer;
   readonly quality: QualityControl;
   readonly startPipeline: () => Pipeline;
   /** Seconds of a monotonic clock. */

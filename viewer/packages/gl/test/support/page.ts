@@ -39,7 +39,7 @@ export class Play {
   readonly canvas = document.createElement("canvas");
   readonly renderer: SplatRenderer;
   readonly sorter: HeldWorker;
-  readonly events: string[] = [];
+  readonly errors: string[] = [];
   private given = new Map<string, unknown>();
 
   constructor(
@@ -52,9 +52,7 @@ export class Play {
     // Without one, the renderer starts the file next to its own.
     const sorter = options.ownSorter ? {} : { sorter: this.sorter as unknown as Worker };
     this.renderer = new SplatRenderer(this.canvas, { ...options, ...sorter });
-    this.renderer.onContextLost = () => this.events.push("lost");
-    this.renderer.onContextRestored = () => this.events.push("restored");
-    this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
+    this.renderer.onError = (error) => this.errors.push(error.message);
     this.renderer.load(reader.header!);
   }
 
