@@ -105,7 +105,7 @@ export class Player extends Emitter<PlayerEvents> {
   /** Opens a stream and closes the last one. `view` is set once the rig is known. */
   load(source: SourceDescription, startSeconds?: number, view?: (rig: Rig) => View): Engine {
     this.engine?.destroy();
-    const engine = new Engine(this.options.startPipeline(), this.sound.now, { sound: this.sound });
+    const engine = new Engine(this.options.startPipeline(), this.sound.now, this.sound);
     this.engine = engine;
     this.rig = undefined;
     this.flight = undefined;

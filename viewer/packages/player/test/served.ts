@@ -7,7 +7,7 @@ import { afterEach } from "vitest";
 import { Decoding } from "../src/decode/decoding.ts";
 import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
 import { Engine } from "../src/engine/engine.ts";
-import type { EngineOptions } from "../src/engine/options.ts";
+import type { Sound } from "../src/sound/sound.ts";
 import type { ReadReply, ReadRequest } from "../src/source/description.ts";
 import { Fetcher } from "../src/source/fetcher.ts";
 import type { Port } from "../src/source/port.ts";
@@ -105,6 +105,12 @@ export interface Playing {
   close(): void;
 }
 
+export interface PlayingOptions {
+  /** Of stored packets. */
+  readonly budgetBytes?: number;
+  readonly sound?: Sound;
+}
+
 let open: Playing[] = [];
 
 afterEach(() => {
@@ -113,19 +119,20 @@ afterEach(() => {
 });
 
 /** An engine that opens a file, which is closed after the test. */
-export function playingFile(file: ServedFile, startSeconds = 0, options: EngineOptions = {}): Playing {
+export function playingFile(file: ServedFile, startSeconds = 0, options: PlayingOptions = {}): Playing {
   const play = playing(file.fetch as typeof fetch, options);
   play.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
   return play;
 }
 
-export function playing(request: typeof fetch, options: EngineOptions = {}): Playing {
+export function playing(request: typeof fetch, options: PlayingOptions = {}): Playing {
   const [engineLine, fetchLine] = [new MessageChannel(), new MessageChannel()];
   new Fetcher(fetchLine.port1 as unknown as Port<ReadReply, ReadRequest>, request, QUICK);
   new Decoding(
     engineLine.port1 as unknown as Port<FromDecoder, ToDecoder>,
     fetchLine.port2 as unknown as Port<ReadRequest, ReadReply>,
     () => new Promise((resolve) => setImmediate(resolve)),
+    options.budgetBytes,
   );
   const pipeline = {
     onmessage: undefined as ((message: FromDecoder) => void) | undefined,
@@ -143,7 +150,7 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     else pipeline.onmessage?.(data);
   };
   const found: Playing = {
-    engine: new Engine(pipeline, () => found.seconds, options),
+    engine: new Engine(pipeline, () => found.seconds, options.sound),
     errors: [],
     notices: [],
     shown: [],

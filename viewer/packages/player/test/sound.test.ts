@@ -3,13 +3,12 @@
 
 import { recordBytes } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
-import type { EngineOptions } from "../src/engine/options.ts";
 import { Player } from "../src/player.ts";
 import { AudioClock } from "../src/sound/audioClock.ts";
 import { oggOf } from "../src/sound/ogg.ts";
 import { Sound } from "../src/sound/sound.ts";
 import { QualityControl } from "../src/view/quality.ts";
-import { CLIP, playingFile, ServedFile } from "./served.ts";
+import { CLIP, type PlayingOptions, playingFile, ServedFile } from "./served.ts";
 import { CLAP_SECONDS, clapping, clappingFile, FPS } from "./soundFile.ts";
 
 vi.setConfig({ testTimeout: 30_000 });
@@ -320,7 +319,7 @@ describe("the sound", () => {
 });
 
 describe("an engine with sound", () => {
-  function opened(bytes: Uint8Array, options: EngineOptions = {}) {
+  function opened(bytes: Uint8Array, options: PlayingOptions = {}) {
     const given = sounding();
     const file = new ServedFile(bytes);
     const play = playingFile(file, 0, { ...options, sound: given.sound });
