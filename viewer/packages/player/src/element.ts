@@ -507,7 +507,7 @@ export class StructgstreamPlayer extends HTMLElement {
   };
 
   private applyAttributes(ui: PlayerUi): void {
-    ui.controls = this.getAttribute("controls") !== "off";
+    ui.controls = this.controls;
     ui.embed = this.hasAttribute("embed") || this.link?.embed === true;
     ui.poster = this.poster === "" ? undefined : new URL(this.poster, document.baseURI).href;
   }
@@ -535,7 +535,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const token = this.token();
     // The page's token also opens its streams; it is not sent to other hosts.
     if (own && token !== null && !url.searchParams.has("token")) url.searchParams.set("token", token);
-    const found = { url: url.href, name: nameOf(url.href), sameOrigin };
+    const found = { url: url.href, name: nameOf(url), sameOrigin };
     return url.pathname.endsWith(".json") ? { kind: "segments", own, ...found } : { kind: "url", ...found };
   }
 
@@ -589,11 +589,8 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 }
 
-function nameOf(url: string): string {
-  return decodedName(new URL(url).pathname.split("/").at(-1) ?? "") || "The stream";
-}
-
-function decodedName(name: string): string {
+function nameOf(url: URL): string {
+  const name = url.pathname.split("/").at(-1) || "The stream";
   try {
     return decodeURIComponent(name);
   } catch {

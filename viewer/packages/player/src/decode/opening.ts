@@ -19,22 +19,21 @@ import {
 } from "@structgstream/core";
 import { joined } from "../source/joined.js";
 import type { ByteClient, ReadingEvents } from "./byteClient.js";
+import type { StreamEvents } from "./stream.js";
 
 const HEAD_BYTES = 4096;
 const TAIL_BYTES = 4096;
 /** Largest number of entries of an index: 3 hours at 100 frames per second. */
 const MAX_INDEX_BYTES = 2 ** 24;
 
-/** Events of opening, in this order: progress, the header, the index if there is one, then packets. */
-export interface OpeningEvents {
+/** Events of opening, in this order: progress, the header, then packets. */
+export interface OpeningEvents extends Pick<StreamEvents, "waiting" | "failed"> {
   /** `ended`: the file ends within its header at present. */
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
   /** `index` is defined if it has the positions of all packets, with the offset after the last one. */
   header(header: StreamHeader, ranged: boolean, index: { entries: IndexEntry[]; end: number } | undefined): void;
   /** The reader has new packets or has found damage; no event follows `ended`. */
   read(reader: StreamReader, ended: boolean): void;
-  waiting(seconds: number, problem: string | undefined): void;
-  failed(message: string): void;
 }
 
 export class Opening {
@@ -48,7 +47,7 @@ export class Opening {
   private announced = false;
   private reading: number | undefined;
   private readonly troubles: Pick<ReadingEvents, "failed" | "waiting"> = {
-    failed: (message) => this.events.failed(message),
+    failed: (message) => this.events.failed(message, true),
     waiting: (seconds, problem) => this.events.waiting(seconds, problem),
   };
 
@@ -195,7 +194,7 @@ export class Opening {
       action();
     } catch (error) {
       this.stop();
-      this.events.failed(error instanceof Error ? error.message : String(error));
+      this.events.failed(error instanceof Error ? error.message : String(error), true);
     }
   }
 

@@ -197,10 +197,7 @@ export class PacketLoader {
         queue.skip(all);
         at += all;
         this.events.changed();
-      } else {
-        this.catalog.markDamaged(run.next);
-        this.events.damaged(run.next, place);
-      }
+      } else this.events.damaged(run.next, place);
     }
     return at;
   }

@@ -177,7 +177,7 @@ export class SegmentStream implements Stream {
     // Parts are removed when they become a segment; the next manifest has the positions of their frames.
     const same = this.catalog.place(first)?.entry?.file === file;
     if (first < end && same && this.attempt(file, temporary) >= ATTEMPTS) {
-      this.events.lost(first, end, problem.replace(/\.$/, ""));
+      this.events.lost(first, end, problem);
       return;
     }
     if (first === end) this.events.notice(problem);
