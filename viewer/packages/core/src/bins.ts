@@ -10,7 +10,7 @@ import type { AdaptiveDecoder } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, type Fields, FREE_COLUMNS, type Tensor } from "./fields.js";
 import { decodedFree, type FreeBins, noFree } from "./freeRows.js";
-import { type Change, decodedChange, noChange } from "./rows.js";
+import { type Change, decodedChange, type Group, noChange } from "./rows.js";
 
 /** Fields of an anchor, which change together: three numbers each, or one per direction of the appearance. */
 const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", "base_scales", "appearance"];
@@ -33,11 +33,7 @@ export interface SceneBins {
   readonly free: FreeBins;
 }
 
-interface Columns {
-  readonly name: FieldName;
-  readonly first: number;
-  readonly end: number;
-}
+type Columns = Group & { readonly name: FieldName };
 
 /** The columns of each dynamic field of anchors; the appearance has the remaining ones of `total`. */
 function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[] {

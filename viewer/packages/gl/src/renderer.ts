@@ -9,7 +9,7 @@ import { Pace } from "./gpu/pace.js";
 import type { Look } from "./gpu/picturePass.js";
 import { Pipeline } from "./gpu/pipeline.js";
 import { LiveScene } from "./scene.js";
-import { Orders, type Sorted, sameWanted } from "./sorting/orders.js";
+import { Orders, type Sorted, sameWanted, type Wanted } from "./sorting/orders.js";
 import type {
   Camera,
   RendererOptions,
@@ -101,17 +101,10 @@ export class SplatRenderer {
   render(camera: Camera, options: RenderOptions = {}): RenderStats {
     this.alive();
     const began = performance.now();
-    const snapshot = this.scene?.latest;
-    if (snapshot) this.orders.want({ snapshot, camera, maxSplats: this.maxSplats });
+    const wanted = this.want(camera);
     const look = this.lookNamed(options.cameraName);
     const drawn = this.pipeline ? this.drawn(this.pipeline, camera, look) : false;
-    const { sorted } = this;
-    const settled =
-      sorted !== undefined &&
-      snapshot !== undefined &&
-      this.pipeline !== undefined &&
-      sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats }) &&
-      this.shows(sorted, camera, look);
+    const settled = this.pipeline !== undefined && this.hasOrder(wanted) && this.shows(this.sorted, camera, look);
     return this.statsOf(drawn, settled, began);
   }
 
@@ -119,9 +112,7 @@ export class SplatRenderer {
   renderViews({ eyes, middle, framebuffer, transparent }: Views): RenderStats {
     this.alive();
     const began = performance.now();
-    const snapshot = this.scene?.latest;
-    const wanted = snapshot && { snapshot, camera: middle, maxSplats: this.maxSplats };
-    if (wanted) this.orders.want(wanted);
+    const wanted = this.want(middle);
     const { pipeline } = this;
     if (pipeline) {
       this.takeOrder(pipeline);
@@ -132,8 +123,7 @@ export class SplatRenderer {
         pipeline.show(camera, MEAN_LOOK, { framebuffer, x, y, transparent });
       }
     }
-    const settled = wanted !== undefined && this.sorted !== undefined && sameWanted(this.sorted, wanted);
-    return this.statsOf(pipeline !== undefined, settled, began);
+    return this.statsOf(pipeline !== undefined, this.hasOrder(wanted), began);
   }
 
   /** Draws until the picture is exact: of the last update, sorted for its camera. */
@@ -211,6 +201,19 @@ export class SplatRenderer {
       sortMilliseconds: sorted?.order.milliseconds ?? 0,
       callMilliseconds: performance.now() - began,
     };
+  }
+
+  /** Requests the order of the present scene for a camera. */
+  private want(camera: Camera): Wanted | undefined {
+    const snapshot = this.scene?.latest;
+    const wanted = snapshot && { snapshot, camera, maxSplats: this.maxSplats };
+    if (wanted) this.orders.want(wanted);
+    return wanted;
+  }
+
+  /** Whether the order in which splats are drawn is the wanted one. */
+  private hasOrder(wanted: Wanted | undefined): boolean {
+    return wanted !== undefined && this.sorted !== undefined && sameWanted(this.sorted, wanted);
   }
 
   /** Takes the newest order, if one has come. */
