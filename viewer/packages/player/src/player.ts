@@ -288,13 +288,7 @@ export class Player extends Emitter<PlayerEvents> {
   private begin(header: StreamHeader, view: ((rig: Rig) => View) | undefined): void {
     const rig = rigOf(header);
     this.rig = rig;
-    try {
-      this.options.renderer.load(header);
-    } catch (error) {
-      this.engine?.destroy();
-      this.emit("error", { message: error instanceof Error ? error.message : String(error), fatal: true });
-      return;
-    }
+    this.options.renderer.load(header);
     this.setView(view ? view(rig) : viewOf(rig.first.camera, rig.focus));
     this.atCamera = view ? undefined : rig.first;
     this.emit("header", header);

@@ -102,7 +102,7 @@ export class FileStream implements Stream {
     const { first, start, end } = catalog.init(period);
     const queue = new ByteQueue();
     this.client.read(start, end, false, {
-      bytes: (bytes) => queue.append(bytes),
+      bytes: ({ bytes }) => queue.append(bytes),
       end: () => {
         try {
           this.chapters.put(period, this.headerIn(queue, start));
@@ -113,11 +113,11 @@ export class FileStream implements Stream {
         coming.delete(period);
         events.stored();
       },
-      failed: (problem) => {
+      failed: ({ message }) => {
         coming.delete(period);
-        events.failed(problem, false);
+        events.failed(message, false);
       },
-      waiting: (seconds, problem) => events.waiting(seconds, problem),
+      waiting: ({ seconds, problem }) => events.waiting(seconds, problem),
     });
   }
 

@@ -47,8 +47,8 @@ export class Opening {
   private announced = false;
   private reading: number | undefined;
   private readonly troubles: Pick<ReadingEvents, "failed" | "waiting"> = {
-    failed: (message) => this.events.failed(message, true),
-    waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+    failed: ({ message }) => this.events.failed(message, true),
+    waiting: ({ seconds, problem }) => this.events.waiting(seconds, problem),
   };
 
   constructor(
@@ -75,7 +75,7 @@ export class Opening {
         this.ranged &&= ranged || !wholeIfNeeded;
         this.lookedForIndex ||= !this.ranged;
       },
-      bytes: (bytes) => this.take(bytes),
+      bytes: ({ bytes }) => this.take(bytes),
       end: then,
       ...this.troubles,
     });
@@ -84,7 +84,7 @@ export class Opening {
   private readTail(start: number, fileBytes: number): void {
     const parts: Uint8Array[] = [];
     this.client.read(start, fileBytes, false, {
-      bytes: (bytes) => parts.push(bytes),
+      bytes: ({ bytes }) => parts.push(bytes),
       end: () => this.lookAtTail(joined(parts), start, fileBytes),
       ...this.troubles,
     });
@@ -118,7 +118,7 @@ export class Opening {
       else this.read(this.loaded, end, false, () => this.headerByIndex(end));
     };
     this.client.read(last.offset, last.offset + TIMED_BYTES, false, {
-      bytes: (bytes) => parts.push(bytes),
+      bytes: ({ bytes }) => parts.push(bytes),
       end: useTime,
       ...this.troubles,
     });
@@ -139,10 +139,10 @@ export class Opening {
       begin: ({ fileBytes }) => {
         this.fileBytes = fileBytes ?? this.fileBytes;
       },
-      bytes: (bytes) => this.take(bytes),
+      bytes: ({ bytes }) => this.take(bytes),
       end: () => this.finish(),
       ...this.troubles,
-      waiting: (seconds, problem) => {
+      waiting: ({ seconds, problem }) => {
         if (!this.announced && problem === undefined) this.events.opening(this.loaded, undefined, true);
         this.events.waiting(seconds, problem);
       },

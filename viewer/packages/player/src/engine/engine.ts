@@ -29,7 +29,7 @@ export class Engine extends Emitter<EngineEvents> {
   /** The end of the stream while it grows. */
   readonly edge = new Edge(this.frames);
   readonly packets = new PacketLog();
-  /** Names of the renditions, and the one in use; undefined if there is only one. */
+  /** Names of the renditions, none if there is only one, and the one in use. */
   qualities: { readonly names: readonly string[]; readonly at: number } = { names: [], at: 0 };
   /** The chosen rendition; undefined for automatic selection. */
   quality: number | undefined;

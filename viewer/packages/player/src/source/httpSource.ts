@@ -12,11 +12,6 @@ import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from ".
 const STILL_SECONDS = 600;
 const TEMPORARY = new Set([408, 429, 500, 502, 503, 504]);
 
-interface ContentRange {
-  readonly start: number | undefined;
-  readonly fileBytes: number | undefined;
-}
-
 export class HttpSource implements ByteSource {
   private growing = true;
   private fileBytes = 0;
@@ -146,7 +141,7 @@ export function refusal(name: string, status: number): SourceError {
 }
 
 /** Parses `bytes 0-9/100` or `bytes * /100`; undefined if it is missing or malformed. */
-function rangeOf(response: Response): ContentRange {
+function rangeOf(response: Response): { start: number | undefined; fileBytes: number | undefined } {
   const header = response.headers.get("Content-Range") ?? "";
   const found = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(header.trim());
   if (!found) return { start: undefined, fileBytes: undefined };
