@@ -72,11 +72,12 @@ def views_of(reader: StreamReader, *, frames: list[int] | None, on_arc: int) -> 
         for name in rig.testing[:HELD_OUT]
         for frame in dict.fromkeys(chosen)
     ]
-    camera = rig[rig.testing[0]]
-    for size in SIZES:
-        small = camera.resized(round(size * camera.width), round(size * camera.height))
-        views.append((f"size-{size:g}-{chosen[0]}", chosen[0], small))
-    views.append((f"nearer-{chosen[0]}", chosen[0], nearer(camera, rig)))
+    for name in rig.testing[:1]:
+        camera = rig[name]
+        for size in SIZES:
+            small = camera.resized(round(size * camera.width), round(size * camera.height))
+            views.append((f"size-{size:g}-{chosen[0]}", chosen[0], small))
+        views.append((f"nearer-{chosen[0]}", chosen[0], nearer(camera, rig)))
     for number, camera in enumerate(arc(rig, on_arc)):
         frame = round(number * (count - 1) / max(on_arc - 1, 1))
         views.append((f"arc-{number}-{frame}", frame, camera))
