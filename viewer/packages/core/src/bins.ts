@@ -9,8 +9,8 @@
 import type { AdaptiveDecoder } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, type Fields, FREE_COLUMNS, type Tensor } from "./fields.js";
-import { decodedFree, type FreeBins, noFree } from "./freeRows.js";
-import { type Change, decodedChange, noChange } from "./rows.js";
+import { decodedFree, type FreeRows, noFree } from "./freeRows.js";
+import { decodedChange, type Group, noChange, type Rows } from "./rows.js";
 
 /** Fields of an anchor, which change together: three numbers each, or one per direction of the appearance. */
 const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", "base_scales", "appearance"];
@@ -24,20 +24,14 @@ export const CODABLE: ReadonlySet<FieldName> = new Set([...ANCHOR_ROWS, ...WEIGH
 
 export type Steps = ReadonlyMap<string, number>;
 
-/** The dynamic part of a scene and its last change; `anchors` is `[M, columns of the dynamic fields]`. */
+/** The dynamic part of a scene; `anchors` have the columns of the dynamic fields. */
 export interface SceneBins {
-  readonly anchors: Int32Array;
-  readonly change: Change;
-  readonly weights: ReadonlyMap<FieldName, Int32Array>;
-  readonly weightChanges: ReadonlyMap<FieldName, Change>;
-  readonly free: FreeBins;
+  readonly anchors: Rows;
+  readonly weights: ReadonlyMap<FieldName, Rows>;
+  readonly free: FreeRows;
 }
 
-interface Columns {
-  readonly name: FieldName;
-  readonly first: number;
-  readonly end: number;
-}
+type Columns = Group & { readonly name: FieldName };
 
 /** The columns of each dynamic field of anchors; the appearance has the remaining ones of `total`. */
 function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[] {
@@ -49,12 +43,15 @@ function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[
 }
 
 /** The same without a last change. */
-export function withoutChange(bins: SceneBins): SceneBins {
+export function withoutChange({ anchors, weights, free }: SceneBins): SceneBins {
+  const still = <Kind extends Rows>(rows: Kind): Kind => ({
+    ...rows,
+    change: noChange(rows.change.history.length, rows.change.columns),
+  });
   return {
-    ...bins,
-    change: noChange(bins.change.history.length, bins.change.columns),
-    weightChanges: new Map([...bins.weights].map(([name, weights]) => [name, noChange(weights.length, 1)])),
-    free: { ...bins.free, change: noChange(bins.free.births.length, FREE_COLUMNS) },
+    anchors: still(anchors),
+    weights: new Map([...weights].map(([name, rows]) => [name, still(rows)])),
+    free: still(free),
   };
 }
 
@@ -75,9 +72,13 @@ export function quantizeState(state: Fields, dynamic: ReadonlySet<FieldName>, st
       for (let i = 0; i < width; i++) anchors[row * columns + first + i] = bins[row * width + i]!;
     }
   }
-  const weights = new Map<FieldName, Int32Array>();
-  for (const name of WEIGHTS) if (dynamic.has(name)) weights.set(name, nearest(state.get(name)!, steps.get(name)!));
-  return withoutChange({ anchors, change: noChange(rows, columns), weights, weightChanges: new Map(), free: noFree() });
+  const weights = new Map<FieldName, Rows>();
+  for (const name of WEIGHTS) {
+    if (!dynamic.has(name)) continue;
+    const bins = nearest(state.get(name)!, steps.get(name)!);
+    weights.set(name, { bins, change: noChange(bins.length, 1) });
+  }
+  return { anchors: { bins: anchors, change: noChange(rows, columns) }, weights, free: noFree() };
 }
 
 function nearest(value: Tensor, step: number): Int32Array {
@@ -98,31 +99,31 @@ function nearest(value: Tensor, step: number): Int32Array {
 
 /** The dynamic fields that the indices represent. */
 export function dequantizeState(
-  bins: SceneBins,
+  { anchors, weights, free }: SceneBins,
   dynamic: ReadonlySet<FieldName>,
   steps: Steps,
 ): Map<FieldName, Tensor> {
   const state = new Map<FieldName, Tensor>();
-  const rows = bins.change.history.length;
-  const { columns } = bins.change;
+  const rows = anchors.change.history.length;
+  const { columns } = anchors.change;
   for (const { name, first, end } of anchorColumns(dynamic, columns)) {
     const step = steps.get(name)!;
     const width = end - first;
     const data = new Float32Array(width * rows);
     for (let i = 0, at = first; i < data.length; i += width, at += columns) {
-      for (let column = 0; column < width; column++) data[i + column] = bins.anchors[at + column]! * step;
+      for (let column = 0; column < width; column++) data[i + column] = anchors.bins[at + column]! * step;
     }
     state.set(name, { shape: [rows, width], data });
   }
-  for (const [name, weights] of bins.weights) {
+  for (const [name, { bins }] of weights) {
     const step = steps.get(name)!;
-    state.set(name, { shape: [weights.length], data: Float32Array.from(weights, (bin) => bin * step) });
+    state.set(name, { shape: [bins.length], data: Float32Array.from(bins, (bin) => bin * step) });
   }
   if (dynamic.has("free")) {
     const byColumn = FREE_STEPS.flatMap((name, i) => Array<number>(FREE_WIDTHS[i]!).fill(steps.get(name)!));
-    const data = Float32Array.from(bins.free.bins, (bin, i) => bin * byColumn[i % FREE_COLUMNS]!);
-    state.set("free", { shape: [bins.free.births.length, FREE_COLUMNS], data });
-    state.set("free_births", { shape: [bins.free.births.length], data: bins.free.births.slice() });
+    const data = Float32Array.from(free.bins, (bin, i) => bin * byColumn[i % FREE_COLUMNS]!);
+    state.set("free", { shape: [free.births.length, FREE_COLUMNS], data });
+    state.set("free_births", { shape: [free.births.length], data: free.births.slice() });
   }
   return state;
 }
@@ -138,19 +139,15 @@ export function decodedScene(
   dynamic: ReadonlySet<FieldName>,
   where: string,
 ): SceneBins {
-  const groups = anchorColumns(dynamic, before.change.columns);
-  const change = decodedChange(decoder, before.change, groups);
-  const anchors = summed(before.anchors, change.residuals, where);
-  const weights = new Map<FieldName, Int32Array>();
-  const weightChanges = new Map<FieldName, Change>();
-  for (const [name, bins] of before.weights) {
-    const found = decodedChange(decoder, before.weightChanges.get(name)!, [{ name, first: 0, end: 1 }]);
-    weightChanges.set(name, found);
-    weights.set(name, summed(bins, found.residuals, where));
-  }
+  const next = (rows: Rows, groups: readonly Group[]): Rows => {
+    const change = decodedChange(decoder, rows.change, groups);
+    return { bins: summed(rows.bins, change.residuals, where), change };
+  };
+  const anchors = next(before.anchors, anchorColumns(dynamic, before.anchors.change.columns));
+  const weights = new Map([...before.weights].map(([name, rows]) => [name, next(rows, [{ name, first: 0, end: 1 }])]));
   const free = dynamic.has("free") ? decodedFree(decoder, before.free, where) : before.free;
   for (const bin of free.bins) checkBin(bin, where);
-  return { anchors, change, weights, weightChanges, free };
+  return { anchors, weights, free };
 }
 
 function summed(bins: Int32Array, residuals: Int32Array, where: string): Int32Array {

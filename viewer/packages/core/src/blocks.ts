@@ -65,33 +65,26 @@ export function blocksIn(payload: Uint8Array, start: number, where: string): Blo
 }
 
 /**
- * The tensors of all blocks from byte `start` to the end, copied byte by byte (bits of NaNs do not change). Requires a
- * little-endian machine, as WebGPU and WebAssembly do.
+ * The fields of all blocks from byte `start` to the end: tensors of those that are not coded, copied byte by byte (bits of
+ * NaNs do not change), and the bytes of coded ones, without a copy. Requires a little-endian machine, as WebGPU and
+ * WebAssembly do.
  *
- * @throws StreamError see {@link blocksIn}, or a block is coded
+ * @param isCoded whether the stream's codec codes a field here
+ * @throws StreamError as {@link blocksIn}, or a block is coded and should not be, or the other way round
  */
-export function unpackedBlocks(payload: Uint8Array, start: number, where: string): Map<FieldName, Tensor> {
-  const { values, coded } = mixedBlocks(payload, start, where);
-  for (const name of coded.keys()) {
-    throw new StreamError(`${where} holds field ${name} coded, where its numbers as they are belong.`);
-  }
-  return values;
-}
-
-/**
- * The tensors of all blocks from byte `start` to the end that are not coded, as in {@link unpackedBlocks}, and the bytes
- * of the coded ones, without a copy.
- *
- * @throws StreamError as {@link blocksIn}
- */
-export function mixedBlocks(
+export function fieldsIn(
   payload: Uint8Array,
   start: number,
   where: string,
+  isCoded: (name: FieldName) => boolean,
 ): { values: Map<FieldName, Tensor>; coded: Map<FieldName, Uint8Array> } {
   const values = new Map<FieldName, Tensor>();
   const coded = new Map<FieldName, Uint8Array>();
   for (const block of blocksIn(payload, start, where)) {
+    if (block.coded !== isCoded(block.name)) {
+      const found = block.coded ? "coded, which its codec does not know" : "as it is, where it should be coded";
+      throw new StreamError(`${where} holds field ${block.name} ${found}.`);
+    }
     if (block.coded) coded.set(block.name, payload.subarray(block.data, block.end));
     else values.set(block.name, tensorOf(payload, block));
   }
@@ -102,17 +95,4 @@ function tensorOf(payload: Uint8Array, block: Block): Tensor {
   const { buffer } = payload.slice(block.data, block.end);
   const data = block.itemBytes === 8 ? new BigInt64Array(buffer) : new Float32Array(buffer);
   return { shape: block.shape, data };
-}
-
-/**
- * The bytes of all blocks from byte `start` to the end, every one coded; they are not copied.
- *
- * @throws StreamError as {@link blocksIn}, or a block is not coded
- */
-export function codedFields(payload: Uint8Array, start: number, where: string): Map<FieldName, Uint8Array> {
-  const { values, coded } = mixedBlocks(payload, start, where);
-  for (const name of values.keys()) {
-    throw new StreamError(`${where} holds field ${name} as it is, where it should be coded.`);
-  }
-  return coded;
 }

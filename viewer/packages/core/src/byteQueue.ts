@@ -28,14 +28,6 @@ export class ByteQueue {
     return this.buffer.subarray(this.start, Math.min(this.start + count, this.end));
   }
 
-  /** Removes the next `count` bytes, which must exist, and returns a copy. */
-  take(count: number): Uint8Array {
-    const bytes = this.buffer.slice(this.start, this.start + count);
-    this.start += count;
-    if (this.start === this.end) this.clear();
-    return bytes;
-  }
-
   /** Removes the next `count` bytes, which must exist. */
   skip(count: number): void {
     this.start += count;

@@ -4,33 +4,21 @@
 import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, fieldIn } from "./fields.js";
-import { decodedSymbols, sectionHead } from "./rans.js";
+import { decodedSymbols } from "./rans.js";
 import { RESIDUAL_ALPHABET, residualsOf } from "./residualSymbols.js";
 import { decodedTables, type FrequencyTables, geometric } from "./tables.js";
 
 const CLASSES = 32; // bit lengths of natural numbers below 2^31
 const FLAT = 128; // geometric row of a context that has not occurred
 
-/** The frequency tables of encoder and decoder, by name; a table that was not used yet is geometric. */
-export class Tables {
-  private readonly sets = new Map<string, FrequencyTables>();
-
-  get(name: string, contexts: number, alphabet: number): FrequencyTables {
-    return this.sets.get(name) ?? geometric(FLAT, contexts, alphabet);
-  }
-
-  put(name: string, tables: FrequencyTables): void {
-    this.sets.set(name, tables);
-  }
-}
-
 /** Decodes one section after another; the part of a name before the dot is the field whose bytes are read. */
 export class Decoder {
   private readonly left: Map<string, Uint8Array>;
+  /** By name of a section, as its last occurrence left them. */
+  private readonly tables = new Map<string, FrequencyTables>();
 
   /** @param where subject of error messages */
   constructor(
-    private readonly tables: Tables,
     fields: ReadonlyMap<FieldName, Uint8Array>,
     private readonly where: string,
   ) {
@@ -81,11 +69,12 @@ export class Decoder {
 
   private section(name: string, contexts: Uint8Array, count: number, alphabet: number): Uint8Array {
     const where = `${this.where}, ${name},`;
-    const before = this.tables.get(name, count, alphabet);
+    const before = this.tables.get(name) ?? geometric(FLAT, count, alphabet);
     const tables = decodedTables(this.taken(name, this.number(name)), before, where);
-    this.tables.put(name, tables);
-    const head = sectionHead(this.leftOf(name), where);
-    return decodedSymbols(this.taken(name, head.bytes), head, contexts, tables, where);
+    this.tables.set(name, tables);
+    const { symbols, bytes } = decodedSymbols(this.leftOf(name), contexts, tables, where);
+    this.taken(name, bytes);
+    return symbols;
   }
 
   private leftOf(name: string): Uint8Array {

@@ -1,14 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Finds where a stream continues after damage (docs/bitstream.md, section Damage). */
 
-import { CHECKSUM_BYTES, HEAD_BYTES, periodAt, RecordType, recordBytes, recordIn, viewOf } from "./records.js";
+import { ZSTD_MAGIC } from "./json.js";
+import {
+  CHECKSUM_BYTES,
+  FRAME_BYTES,
+  HEAD_BYTES,
+  INDEX_ENTRY_BYTES,
+  periodAt,
+  RecordType,
+  recordBytes,
+  recordIn,
+  viewOf,
+} from "./records.js";
 
-const FRAME_BYTES = 12;
-const INDEX_ENTRY_BYTES = 13;
 const MIN_PACKET_BYTES = HEAD_BYTES + FRAME_BYTES + CHECKSUM_BYTES;
 const WORK = 4;
-/** Offset of the description in an init record, and its first bytes: it is a zstd frame. */
-const ZSTD = [HEAD_BYTES + 4, 0xfd2fb528] as const;
+/** Offset of the description, which is a zstd frame, in an init record. */
+const DESCRIPTION_AT = HEAD_BYTES + 4;
 
 /** A damaged record that others follow, and the lost frames from `first` to before `end`. */
 export interface Damage {
@@ -89,7 +98,7 @@ function canFollow(view: DataView, at: number, size: number, offset: number, dam
   const length = size - HEAD_BYTES - CHECKSUM_BYTES;
   if (kind === RecordType.index) return length % INDEX_ENTRY_BYTES === 0;
   if (length < FRAME_BYTES) return false;
-  if (kind === RecordType.init) return view.getUint32(at + ZSTD[0], true) === ZSTD[1];
+  if (kind === RecordType.init) return view.getUint32(at + DESCRIPTION_AT, true) === ZSTD_MAGIC;
   const seconds = view.getFloat64(at + HEAD_BYTES + 4, true);
   const later = Number.isFinite(seconds) && seconds > damaged.afterSeconds;
   return later && isBetween(view.getUint32(at + HEAD_BYTES, true), offset, damaged);

@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 /** From packets to scenes: everything that a receiver needs except a renderer. */
 
-import { blocksIn, codedFields, unpackedBlocks } from "./blocks.js";
+import { blocksIn, fieldsIn } from "./blocks.js";
 import { CompactDecoder } from "./compact.js";
 import { StreamError } from "./errors.js";
 import { checkShapes, type FieldName, type Fields, mergedFields } from "./fields.js";
-import { type StreamHeader, trainingCameras } from "./header.js";
-import { viewOf } from "./records.js";
-
-export const FRAME_BYTES = 12;
+import type { StreamHeader } from "./header.js";
+import { FRAME_BYTES, viewOf } from "./records.js";
 
 /** One packet: a key packet needs only the header, a delta packet also the packet before it. */
 export interface Packet {
@@ -42,33 +40,6 @@ export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
   return { isKey, index, ptsSeconds, payload };
 }
 
-/**
- * Checks that a packet can come next.
- *
- * @param expected the frame that it must be
- * @param begins whether it is the first after an init record
- * @param afterSeconds presentation time of the last one
- * @param name name of the stream in messages
- */
-export function checkFollows(
-  facts: Omit<Packet, "payload">,
-  expected: number,
-  begins: boolean,
-  afterSeconds: number,
-  name: string,
-): void {
-  if (facts.index !== expected) {
-    throw new StreamError(`${name} has packet ${facts.index} where packet ${expected} belongs.`);
-  }
-  if (begins && !facts.isKey) {
-    const what = expected ? `A period of ${name}` : name;
-    throw new StreamError(`${what} begins with a delta packet; the first must be a key packet.`);
-  }
-  if (facts.ptsSeconds <= afterSeconds) {
-    throw new StreamError(`In ${name} packet ${facts.index} is not presented after the one before it.`);
-  }
-}
-
 /** Decodes the packets of one stream in order from any key packet; with codec `raw` in any order. */
 export class SceneDecoder {
   private readonly compact: CompactDecoder | undefined;
@@ -84,14 +55,11 @@ export class SceneDecoder {
    * @throws StreamError the packet is damaged, contradicts the header, or needs one that has not been decoded
    */
   decode(packet: Packet): Frame {
-    const { header, compact } = this;
+    const { header } = this;
     const { index, ptsSeconds } = packet;
-    const where = `Packet ${index}`;
-    this.advance(packet);
-    const dynamic = compact ? compact.values() : unpackedBlocks(packet.payload, FRAME_BYTES, where);
-    const fields = mergedFields(header.static, dynamic);
-    const facts = { distanceInput: header.distanceInput, trainingCameras: trainingCameras(header) };
-    checkShapes(fields, facts, where);
+    const values = this.taken(packet);
+    const fields = mergedFields(header.static, this.compact?.values() ?? values);
+    checkShapes(fields, header, `Packet ${index}`);
     return { index, ptsSeconds, fields };
   }
 
@@ -100,11 +68,17 @@ export class SceneDecoder {
    *
    * @throws StreamError see {@link decode}
    */
-  advance({ payload, isKey, index }: Packet): void {
+  advance(packet: Packet): void {
+    this.taken(packet);
+  }
+
+  /** The fields that a packet has as they are: all of them with codec `raw`, otherwise none. */
+  private taken({ payload, isKey, index }: Packet): Fields {
     const where = `Packet ${index}`;
-    const names = blocksIn(payload, FRAME_BYTES, where).map((block) => block.name);
-    checkNames(names, this.header, where);
-    this.compact?.advance(codedFields(payload, FRAME_BYTES, where), isKey, index);
+    const { values, coded } = fieldsIn(payload, FRAME_BYTES, where, () => this.compact !== undefined);
+    checkNames([...values.keys(), ...coded.keys()], this.header, where);
+    this.compact?.advance(coded, isKey, index);
+    return values;
   }
 }
 

@@ -29,14 +29,14 @@ export type FieldName = (typeof FIELD_TABLE)[number][0];
 export const FIELD_NAMES: readonly FieldName[] = FIELD_TABLE.map(([name]) => name);
 
 /** Optional fields; a scene has both of the first two or neither. */
-const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
+export const OPTIONAL_FIELDS: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
 
 /** Rows of an environment: spherical harmonics up to degree 0, 1 and 2. */
 const ENVIRONMENT_ROWS: readonly number[] = [1, 4, 9];
 
 /** Whether these are the fields of a scene. */
 export function isScene(names: ReadonlySet<FieldName>): boolean {
-  const whole = FIELD_NAMES.every((name) => names.has(name) || OPTIONAL.includes(name));
+  const whole = FIELD_NAMES.every((name) => names.has(name) || OPTIONAL_FIELDS.includes(name));
   return whole && names.has("appearance") === names.has("appearance_basis");
 }
 
@@ -71,10 +71,10 @@ export function mergedFields(first: Fields, second: Fields): Map<FieldName, Tens
   return merged;
 }
 
-/** Facts that {@link checkShapes} needs in addition to the fields. */
-export interface ShapeFacts {
+/** What {@link checkShapes} needs of a header. */
+interface ShapeFacts {
   readonly distanceInput: boolean;
-  readonly trainingCameras: number;
+  readonly cameras: readonly { readonly heldOut: boolean }[];
 }
 
 /**
@@ -82,8 +82,9 @@ export interface ShapeFacts {
  *
  * @throws StreamError they are not; the message names the first field that does not fit
  */
-export function checkShapes(fields: Fields, facts: ShapeFacts, where: string): void {
-  const sizes = new Map<string, number>([["V", facts.trainingCameras]]);
+export function checkShapes(fields: Fields, header: ShapeFacts, where: string): void {
+  const training = header.cameras.filter((camera) => !camera.heldOut).length;
+  const sizes = new Map<string, number>([["V", training]]);
   for (const [name, expected] of FIELD_TABLE) {
     const value = fields.get(name);
     if (value !== undefined) matchShape(name, value, expected, sizes, where);
@@ -98,7 +99,7 @@ export function checkShapes(fields: Fields, facts: ShapeFacts, where: string): v
   if (k < 1 || features < 1) {
     throw new StreamError(`${where} has ${k} Gaussians and ${features} features an anchor; both must be 1 up.`);
   }
-  const inputs = features + 3 + Number(facts.distanceInput);
+  const inputs = features + 3 + Number(header.distanceInput);
   let hidden: number | undefined;
   for (const [letter, outputs] of [["P_alpha", k] as const, ["P_c", 3 * k] as const, ["P_Sigma", 7 * k] as const]) {
     const weights = sizes.get(letter);

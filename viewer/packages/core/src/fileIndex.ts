@@ -1,14 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Index and footer: positions of the packets in a stored file, without reading them (docs/bitstream.md). */
 
-import { HEAD_BYTES, RecordType, recordIn, viewOf } from "./records.js";
+import { FRAME_BYTES, HEAD_BYTES, INDEX_ENTRY_BYTES, RecordType, recordIn, viewOf } from "./records.js";
 
 export const FOOTER_BYTES = 16;
-const ENTRY_BYTES = 13;
 const FOOTER_MAGIC = "SGSINDEX";
 
 /** Bytes at the start of a packet's record that {@link packetSeconds} reads. */
-export const TIMED_BYTES = HEAD_BYTES + 12;
+export const TIMED_BYTES = HEAD_BYTES + FRAME_BYTES;
 
 /** The presentation time in the first bytes of a packet's record, unverified. */
 export function packetSeconds(bytes: Uint8Array): number {
@@ -38,11 +37,11 @@ export function indexOffset(footer: Uint8Array, fileBytes: number): number | und
  */
 export function indexEntries(bytes: Uint8Array, offset: number): IndexEntry[] | undefined {
   const record = recordIn(bytes, offset);
-  if (record?.type !== RecordType.index || record.payload.length % ENTRY_BYTES) return undefined;
+  if (record?.type !== RecordType.index || record.payload.length % INDEX_ENTRY_BYTES) return undefined;
   const view = viewOf(record.payload);
   const entries: IndexEntry[] = [];
   let begins = true;
-  for (let at = 0, before = 0, packets = 0; at < record.payload.length; at += ENTRY_BYTES) {
+  for (let at = 0, before = 0, packets = 0; at < record.payload.length; at += INDEX_ENTRY_BYTES) {
     const type = view.getUint8(at + 4);
     const entry = {
       index: view.getUint32(at, true),

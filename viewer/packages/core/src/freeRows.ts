@@ -4,7 +4,7 @@
 import { type AdaptiveDecoder, bitLength } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { FREE_COLUMNS } from "./fields.js";
-import { type Change, decodedChange, type Group, noChange, placesOf } from "./rows.js";
+import { type Change, decodedChange, type Group, noChange, placesOf, type Rows } from "./rows.js";
 
 /** Largest number of free Gaussians: a symbol can take less than a bit, so bytes do not bound their number. */
 export const MAX_FREE = 2 ** 18;
@@ -21,19 +21,17 @@ const MEANS = [6, 7, 8, 9, 10]; // quaternions and opacities
 const LED = [12, 13]; // green and blue
 const BORN_CONTEXTS = [FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13];
 
-/** Free Gaussians as indices `[F, 14]`, their ascending identities, and their last change. */
-export interface FreeBins {
+/** Free Gaussians as indices `[F, 14]`, and their ascending identities. */
+export interface FreeRows extends Rows {
   readonly births: BigInt64Array;
-  readonly bins: Int32Array;
-  readonly change: Change;
 }
 
-export function noFree(): FreeBins {
+export function noFree(): FreeRows {
   return { births: new BigInt64Array(0), bins: new Int32Array(0), change: noChange(0, FREE_COLUMNS) };
 }
 
 /** The free Gaussians of the frame after `before`. */
-export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: string): FreeBins {
+export function decodedFree(decoder: AdaptiveDecoder, before: FreeRows, where: string): FreeRows {
   const alive = placesOf(decoder.flags("free_births.alive", before.change.history, 8));
   const kept: Change = {
     history: Uint8Array.from(alive, (row) => before.change.history[row]!),
@@ -73,7 +71,7 @@ function rowsOf(values: Int32Array, rows: Int32Array): Int32Array {
 }
 
 /** The spawned Gaussians, given the indices of the remaining ones. */
-function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: string): Pick<FreeBins, "births" | "bins"> {
+function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: string): Pick<FreeRows, "births" | "bins"> {
   const count = decoder.numbers("free_births.count", new Int32Array(1), [1])[0]!;
   if (count < 0 || count > MAX_FREE - alive.length / FREE_COLUMNS) {
     throw new StreamError(

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Frames as arrays of plain Gaussians, for any renderer (docs/bitstream.md, From fields to a picture). */
 
-import type { Fields, Tensor } from "./fields.js";
+import { type Fields, FREE_COLUMNS, type Tensor } from "./fields.js";
 import type { StreamHeader } from "./header.js";
 
 /** A camera's centre or another point: x, y, z, in the capture's axes and units. */
@@ -33,7 +33,6 @@ export interface GaussianOptions {
 const MIN_OPACITY = 1 / 255;
 /** Opacities are the tanh of an output. */
 const MIN_OUTPUT = Math.atanh(MIN_OPACITY);
-const FREE_COLUMNS = 14;
 
 /** Evaluates the MLPs of a stream's frames on this thread. */
 export class GaussianEvaluator {

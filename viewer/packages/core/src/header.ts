@@ -56,7 +56,3 @@ export function difference(first: StreamHeader, later: StreamHeader): string | u
     ? undefined
     : "its cameras, similarity, fps, codec or sound are not those of the first";
 }
-
-export function trainingCameras(header: StreamHeader): number {
-  return header.cameras.filter((camera) => !camera.heldOut).length;
-}

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Reads a header from the init record (docs/bitstream.md, section Init record). */
 
-import { mixedBlocks } from "./blocks.js";
+import { fieldsIn } from "./blocks.js";
 import { checkCodec } from "./compact.js";
 import { StreamError } from "./errors.js";
 import { checkShapes, type FieldName, type Fields, isFieldName, isScene, mergedFields, type Tensor } from "./fields.js";
-import { type Camera, type StreamHeader, trainingCameras } from "./header.js";
+import type { Camera, StreamHeader } from "./header.js";
 import { unpackedJson } from "./json.js";
 import { viewOf } from "./records.js";
 import type { SoundFormat } from "./sound.js";
@@ -31,26 +31,17 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   if (!isScene(new Set([...header.dynamic, ...header.static.keys()]))) {
     throw new StreamError("The init record does not hold every field that packets leave out, and only those.");
   }
-  const facts = { distanceInput: header.distanceInput, trainingCameras: trainingCameras(header) };
-  checkShapes(new Map([...header.static, ...header.reference]), facts, "The init record");
+  checkShapes(new Map([...header.static, ...header.reference]), header, "The init record");
   checkCodec(header);
   return header;
 }
 
 /** With `compact`, nearly all fields are coded; with another codec none is. */
 function fieldsOf(description: Record<string, unknown>, payload: Uint8Array, start: number): Fields {
-  const { values, coded } = mixedBlocks(payload, start, "The init record");
-  if (description.codec !== "compact") {
-    for (const name of coded.keys()) {
-      throw new StreamError(`The init record holds field ${name} coded, which its codec does not know.`);
-    }
-    return values;
-  }
-  for (const name of values.keys()) {
-    if (!AS_THEY_ARE.has(name)) {
-      throw new StreamError(`The init record holds field ${name} as it is, where it should be coded.`);
-    }
-  }
+  const isCompact = description.codec === "compact";
+  const isCoded = (name: FieldName) => isCompact && !AS_THEY_ARE.has(name);
+  const { values, coded } = fieldsIn(payload, start, "The init record", isCoded);
+  if (!isCompact) return values;
   return mergedFields(values, decodedFields(coded, stepsOf(description.init_steps, "init_steps")));
 }
 

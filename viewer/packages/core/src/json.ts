@@ -6,7 +6,7 @@ import { StreamError } from "./errors.js";
 import { viewOf } from "./records.js";
 
 const MAX_JSON_BYTES = 2 ** 20;
-const ZSTD_MAGIC = 0xfd2fb528;
+export const ZSTD_MAGIC = 0xfd2fb528;
 
 /**
  * The value in the frame; its stated size is checked before decompression.

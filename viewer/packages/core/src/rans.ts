@@ -6,38 +6,6 @@ import { viewOf } from "./records.js";
 import { type FrequencyTables, TOTAL } from "./tables.js";
 
 const LANES = [1, 4, 32];
-const MAX_SYMBOLS = 2 ** 31 - 1;
-
-/** The head of a section: `start` is the offset of its states, `bytes` its length. */
-export interface SectionHead {
-  readonly symbols: number;
-  readonly words: number;
-  readonly lanes: number;
-  readonly start: number;
-  readonly bytes: number;
-}
-
-/**
- * The head of the section at the beginning of `data`, which may be longer.
- *
- * @throws StreamError it is damaged, or the section longer than the data
- */
-export function sectionHead(data: Uint8Array, where: string): SectionHead {
-  const [symbols, next] = varintAt(data, 0, where);
-  if (symbols === 0) return { symbols, words: 0, lanes: 0, start: next, bytes: next };
-  const [value, start] = varintAt(data, next, where);
-  const words = Math.floor(value / 4);
-  const lanes = LANES[value % 4];
-  // A symbol takes at most one word.
-  if (symbols > MAX_SYMBOLS || words > symbols || lanes === undefined) {
-    throw new StreamError(`${where} states ${symbols} symbols in ${words} words; it is damaged.`);
-  }
-  const bytes = start + 4 * lanes + 2 * words;
-  if (bytes > data.length) {
-    throw new StreamError(`${where} states ${bytes} bytes, ${data.length} are left; it is damaged.`);
-  }
-  return { symbols, words, lanes, start, bytes };
-}
 
 function varintAt(data: Uint8Array, start: number, where: string): [value: number, next: number] {
   let value = 0;
@@ -50,25 +18,33 @@ function varintAt(data: Uint8Array, start: number, where: string): [value: numbe
 }
 
 /**
- * The symbols u8 `[n]` of the section at the beginning of `data`.
+ * The symbols u8 `[n]` of the section at the beginning of `data`, and the length of the section in bytes.
  *
- * @param contexts `[n]`, each below `tables.contexts`; the section must state this number of symbols
- * @throws StreamError the section is damaged, or has another number of symbols
+ * @param contexts `[n]`, each below `tables.contexts`
+ * @throws StreamError the section is damaged or cut, or states another number of symbols
  */
 export function decodedSymbols(
   data: Uint8Array,
-  head: SectionHead,
   contexts: Uint8Array,
   tables: FrequencyTables,
   where: string,
-): Uint8Array {
+): { symbols: Uint8Array; bytes: number } {
   const count = contexts.length;
-  if (head.symbols !== count) {
-    throw new StreamError(`${where} states ${head.symbols} symbols, ${count} are expected; it is damaged.`);
+  const [stated, next] = varintAt(data, 0, where);
+  if (stated !== count) {
+    throw new StreamError(`${where} states ${stated} symbols, ${count} are expected; it is damaged.`);
   }
   const symbols = new Uint8Array(count);
-  if (count === 0) return symbols;
-  const { lanes, start } = head;
+  if (count === 0) return { symbols, bytes: next };
+  const [value, start] = varintAt(data, next, where);
+  const words = Math.floor(value / 4);
+  const lanes = LANES[value % 4];
+  // A symbol takes at most one word.
+  if (words > count || lanes === undefined) {
+    throw new StreamError(`${where} states ${count} symbols in ${words} words; it is damaged.`);
+  }
+  const end = start + 4 * lanes + 2 * words;
+  if (end > data.length) throw new StreamError(`${where} states ${end} bytes, ${data.length} are left; it is damaged.`);
   const view = viewOf(data);
   // States are below 2^32 and stored as int32: every operation below gives the same bits as on unsigned numbers.
   const states = new Int32Array(lanes);
@@ -80,7 +56,6 @@ export function decodedSymbols(
   const starts = startsOf(tables);
   const width = tables.alphabet + 1;
   let word = start + 4 * lanes;
-  const end = word + 2 * head.words;
   for (let i = 0, lane = 0; i < count && sound; i++) {
     const x = states[lane]!;
     const slot = x & (TOTAL - 1);
@@ -101,7 +76,7 @@ export function decodedSymbols(
   if (!sound || word !== end || states.some((state) => state !== TOTAL << 4)) {
     throw new StreamError(`${where} is damaged: its words and final states contradict each other.`);
   }
-  return symbols;
+  return { symbols, bytes: end };
 }
 
 /** Cumulative frequencies `[contexts, alphabet + 1]`. */

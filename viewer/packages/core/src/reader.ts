@@ -8,7 +8,7 @@
 
 import { ByteQueue } from "./byteQueue.js";
 import { type Damage, lastFrame, Search, type Standing } from "./damage.js";
-import { checkFollows, type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
+import { type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 import { StreamError } from "./errors.js";
 import { difference, type Period, type StreamHeader } from "./header.js";
 import { unpackedHeader } from "./initRecord.js";
@@ -45,6 +45,14 @@ interface Begun extends Period {
   header: StreamHeader | undefined;
 }
 
+/** A complete packet; its payload is undefined if it was removed. */
+interface Kept {
+  readonly info: PacketInfo;
+  payload: Uint8Array | undefined;
+  /** Whether no packet that it needs is lost. */
+  readonly shown: boolean;
+}
+
 /** The sound of a frame; its record ends at byte `end` of the stream. */
 export interface StoredSound extends FrameSound {
   readonly end: number;
@@ -53,11 +61,9 @@ export interface StoredSound extends FrameSound {
 export class StreamReader {
   private readonly queue = new ByteQueue();
   private readonly search = new Search();
-  // By frame, as `infos` is: undefined for lost packets, and payloads also for removed ones.
-  private readonly payloads: (Uint8Array | undefined)[] = [];
-  private readonly infos: (PacketInfo | undefined)[] = [];
+  /** By frame; undefined for lost packets. */
+  private readonly frames: (Kept | undefined)[] = [];
   private sounds: StoredSound[] = [];
-  private readonly shown: boolean[] = [];
   private readonly whole: PacketInfo[] = [];
   private readonly damaged: Standing[] = [];
   private searching: Standing | undefined;
@@ -67,7 +73,7 @@ export class StreamReader {
   /** The next packet is the first of its period. */
   private begins = true;
   private afterSeconds = Number.NEGATIVE_INFINITY;
-  private kept = 0;
+  private forgotten = 0;
   private offset = 0;
   private decoder: { readonly of: StreamHeader; readonly scenes: SceneDecoder } | undefined;
   private failure: StreamError | undefined;
@@ -105,8 +111,8 @@ export class StreamReader {
   /** Damaged records that others follow, with their lost frames as far as known. */
   get damage(): readonly Damage[] {
     return this.damaged.map(({ offset, expected }) => {
-      const shown = this.shown.indexOf(true, expected);
-      return { offset, first: expected, end: shown < 0 ? this.infos.length : shown };
+      const shown = this.frames.findIndex((kept, index) => index >= expected && kept?.shown);
+      return { offset, first: expected, end: shown < 0 ? this.frames.length : shown };
     });
   }
 
@@ -162,7 +168,7 @@ export class StreamReader {
    * @throws StreamError there is no such frame, or it was removed, lost or damaged
    */
   frame(index: number): Frame {
-    if (!this.shown[index]) throw this.missing(index);
+    if (!this.frames[index]?.shown) throw this.missing(index);
     const scenes = this.decoderOf(index);
     const [start, after] = [this.groupStart(index), (this.decoded ?? index) + 1];
     const first = start < after && after <= index ? after : start;
@@ -176,14 +182,14 @@ export class StreamReader {
   /** The first packet that frame `index` needs: a key packet; with codec `raw` its own. */
   groupStart(index: number): number {
     let first = index;
-    while (this.header?.codec !== "raw" && first > 0 && !this.infos[first]?.isKey) first--;
+    while (this.header?.codec !== "raw" && first > 0 && !this.frames[first]?.info.isKey) first--;
     return first;
   }
 
   /** Removes the packets that no frame from `index` on needs. */
   forget(index: number): void {
-    const end = this.groupStart(Math.min(index, this.infos.length - 1));
-    for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
+    const end = this.groupStart(Math.min(index, this.frames.length - 1));
+    for (; this.forgotten < end; this.forgotten++) this.remove(this.forgotten);
     this.sounds = this.sounds.filter((sound) => sound.index >= end);
   }
 
@@ -194,7 +200,7 @@ export class StreamReader {
    */
   take(index: number): Packet {
     const packet = this.packet(index);
-    this.payloads[index] = undefined;
+    this.remove(index);
     return packet;
   }
 
@@ -219,14 +225,19 @@ export class StreamReader {
         `Frame ${index} of ${this.name} is lost: the record at byte ${offset}, where frame ${first} should be, is damaged.`,
       );
     }
-    const have = this.infos.length ? `frames 0 to ${this.infos.length - 1}` : "no whole frame";
+    const have = this.frames.length ? `frames 0 to ${this.frames.length - 1}` : "no whole frame";
     return new StreamError(`${this.name} has ${have}; there is no frame ${index}.`);
   }
 
   private packet(index: number): Packet {
-    const [info, payload] = [this.infos[index], this.payloads[index]];
-    if (!info || !payload) throw new StreamError(`Frame ${index} of ${this.name} is no longer in memory.`);
-    return { ...info, payload };
+    const kept = this.frames[index];
+    if (!kept?.payload) throw new StreamError(`Frame ${index} of ${this.name} is no longer in memory.`);
+    return { ...kept.info, payload: kept.payload };
+  }
+
+  private remove(index: number): void {
+    const kept = this.frames[index];
+    if (kept) kept.payload = undefined;
   }
 
   private advance(): void {
@@ -234,8 +245,7 @@ export class StreamReader {
       const prefix = this.queue.peek(PREFIX_BYTES);
       if (prefix.length === PREFIX_BYTES || !isSignature(prefix)) checkPrefix(prefix, this.name);
       if (prefix.length < PREFIX_BYTES) return;
-      this.queue.take(PREFIX_BYTES);
-      this.offset = PREFIX_BYTES;
+      this.skip(PREFIX_BYTES);
     }
     while (this.standing === "reading") {
       if (this.searching && !this.searched(this.searching, true)) break;
@@ -283,11 +293,7 @@ export class StreamReader {
   }
 
   private loseUpTo(next: number): void {
-    while (this.infos.length < next) {
-      this.infos.push(undefined);
-      this.payloads.push(undefined);
-      this.shown.push(false);
-    }
+    while (this.frames.length < next) this.frames.push(undefined);
   }
 
   private skip(count: number): void {
@@ -303,7 +309,7 @@ export class StreamReader {
     }
     const period = begun.at(-1)!.number;
     const since = this.open?.since ?? offset;
-    this.searching = { offset, expected: this.infos.length, afterSeconds, period, since };
+    this.searching = { offset, expected: this.frames.length, afterSeconds, period, since };
     this.skip(1);
   }
 
@@ -323,7 +329,7 @@ export class StreamReader {
       this.addPacket(packetOf(record.payload, record.type === RecordType.key), record.offset, bytes);
     } else if (record.type === RecordType.sound && this.header?.sound?.codec === "opus") {
       const sound = soundOf(record.payload);
-      if (!this.open && sound?.index === this.infos.length - 1) {
+      if (!this.open && sound?.index === this.frames.length - 1) {
         this.sounds.push({ ...sound, end: record.offset + bytes });
       }
     }
@@ -341,7 +347,7 @@ export class StreamReader {
     const differing = first && difference(first, header);
     if (differing) throw new StreamError(`Period ${period} of ${this.name} does not belong to it: ${differing}.`);
     if (this.begins && first) begun.pop(); // a period without a complete packet
-    begun.push({ number: period, first: this.infos.length, offset, bytes, header });
+    begun.push({ number: period, first: this.frames.length, offset, bytes, header });
     this.begins = true;
   }
 
@@ -349,16 +355,29 @@ export class StreamReader {
     const { index, isKey } = facts;
     const { open, begins } = this;
     if (open && index <= lastFrame(open, offset)) this.loseUpTo(index);
-    checkFollows(facts, this.infos.length, begins && !open, this.afterSeconds, this.name);
+    this.checkFollows(facts);
     if (begins) this.begun.push({ ...this.begun.pop()!, first: this.begun.length ? index : 0 });
     this.open = undefined;
     this.begins = false;
     const info = { ...facts, offset, bytes };
-    this.infos.push(info);
+    const shown = isKey || this.header?.codec === "raw" || (!begins && this.frames[index - 1]?.shown === true);
+    this.frames.push({ info, payload, shown });
     this.whole.push(info);
-    this.payloads.push(payload);
-    this.shown.push(isKey || this.header?.codec === "raw" || (!begins && this.shown[index - 1] === true));
     this.afterSeconds = facts.ptsSeconds;
+  }
+
+  /** Checks that a packet can come next. */
+  private checkFollows({ index, isKey, ptsSeconds }: Omit<Packet, "payload">): void {
+    const { name } = this;
+    const expected = this.frames.length;
+    if (index !== expected) throw new StreamError(`${name} has packet ${index} where packet ${expected} belongs.`);
+    if (this.begins && !this.open && !isKey) {
+      const what = expected ? `A period of ${name}` : name;
+      throw new StreamError(`${what} begins with a delta packet; the first must be a key packet.`);
+    }
+    if (ptsSeconds <= this.afterSeconds) {
+      throw new StreamError(`In ${name} packet ${index} is not presented after the one before it.`);
+    }
   }
 }
 

@@ -8,6 +8,9 @@ export const MAJOR = 2;
 export const PREFIX_BYTES = 12;
 export const HEAD_BYTES = 8;
 export const CHECKSUM_BYTES = 4;
+/** Index and presentation time at the beginning of a packet's payload. */
+export const FRAME_BYTES = 12;
+export const INDEX_ENTRY_BYTES = 13;
 const MAGIC = [0x89, 0x53, 0x47, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 
 /** One record; `offset` is the offset of its first byte in the stream, `period` the number of its period. */

@@ -17,6 +17,12 @@ export interface Change {
   readonly columns: number;
 }
 
+/** Indices `[n, columns]`, and their last change. */
+export interface Rows {
+  readonly bins: Int32Array;
+  readonly change: Change;
+}
+
 /** Columns from `first` to below `end`, with models of their own. */
 export interface Group {
   readonly name: string;

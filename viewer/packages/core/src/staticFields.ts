@@ -2,7 +2,7 @@
 /** The init record's fields as bins, entropy coded (docs/bitstream.md, section Coded init fields). */
 
 import { LARGEST } from "./bins.js";
-import { Decoder, Tables } from "./coder.js";
+import { Decoder } from "./coder.js";
 import { StreamError } from "./errors.js";
 import { FIELD_NAMES, type FieldName, type Tensor } from "./fields.js";
 
@@ -44,17 +44,16 @@ interface Bins {
 /**
  * The fields of coded blocks.
  *
- * @throws StreamError the bytes are damaged, or there is no step or no coding for a field
+ * @throws StreamError the bytes are damaged, or there is no step for a field
  */
 export function decodedFields(
   coded: ReadonlyMap<FieldName, Uint8Array>,
   steps: ReadonlyMap<string, number>,
 ): Map<FieldName, Tensor> {
   for (const name of coded.keys()) {
-    if (AS_THEY_ARE.has(name)) throw new StreamError(`${WHERE} holds ${name} coded; it has no coding.`);
     if (!steps.has(name)) throw new StreamError(`The header states no step for ${name} in the init record.`);
   }
-  const decoder = new Decoder(new Tables(), coded, WHERE);
+  const decoder = new Decoder(coded, WHERE);
   let bytes = 0;
   for (const data of coded.values()) bytes += data.length;
   const found = decodedBins(decoder, coded, new Budget(FREE_NUMBERS + NUMBERS_A_BYTE * bytes));

@@ -5,7 +5,7 @@ import { expect, test } from "vitest";
 import { BitReader } from "../src/bits.ts";
 import { Arithmetic, Model, NUMBER_NODES } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
-import { decodedSymbols, sectionHead } from "../src/rans.ts";
+import { decodedSymbols } from "../src/rans.ts";
 import { residualsOf } from "../src/residualSymbols.ts";
 import { decodedTables, geometricRow } from "../src/tables.ts";
 
@@ -14,7 +14,7 @@ const TABLES = { contexts: 2, alphabet: 2, rows: Uint16Array.of(3072, 1024, 3, 4
 const CONTEXTS = Uint8Array.of(0, 0, 1, 1);
 
 function symbols(section: Uint8Array, contexts = CONTEXTS): Uint8Array {
-  return decodedSymbols(section, sectionHead(section, "It"), contexts, TABLES, "It");
+  return decodedSymbols(section, contexts, TABLES, "It").symbols;
 }
 
 test("symbols", () => {

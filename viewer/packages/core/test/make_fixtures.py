@@ -6,7 +6,6 @@ Run from the repository's root when the codec changes: ``python viewer/packages/
 """
 
 import argparse
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -158,8 +157,7 @@ def write_fixture(name: str, data: bytes, scenes: list[Scene]) -> None:
         frames.append({"pts_seconds": index / 30, "key": index % GROUP == 0, "fields": places})
     (FOLDER / f"{name}.sgs").write_bytes(data)
     (FOLDER / f"{name}.bin").write_bytes(numbers)
-    sums = {end: hashlib.sha256(content).hexdigest() for end, content in (("sgs", data), ("bin", numbers))}
-    (FOLDER / f"{name}.json").write_text(json.dumps({"sha256": sums, "frames": frames}) + "\n")
+    (FOLDER / f"{name}.json").write_text(json.dumps({"frames": frames}) + "\n")
 
 
 def main() -> None:

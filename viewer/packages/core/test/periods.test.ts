@@ -121,9 +121,3 @@ test("a stream of one period is read as before by what stands in its records", (
   const reader = readStream(bytesOf(VECTORS, "version-2-compact.sgs"));
   expect(reader.periods).toMatchObject([{ number: 0, first: 0, offset: PREFIX_BYTES }]);
 });
-
-test("headers that nobody needs any more can be dropped", () => {
-  const reader = readStream(STREAM);
-  reader.forgetHeaders();
-  expect([reader.headerOf(0), reader.headerOf(1)].every(Boolean)).toBe(true);
-});

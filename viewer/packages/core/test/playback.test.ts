@@ -64,14 +64,6 @@ test("loops, at another rate, and time while paused or hidden does not count", (
   expect(playback.currentTime - currentTime).toBeCloseTo(0.01);
 });
 
-test("a frame that skips others is the one that a new reader decodes", () => {
-  const [reader, other] = [readStream(STREAM), readStream(STREAM)];
-  const last = reader.packets.at(-1)!.index;
-  reader.frame(last - 2);
-  expect(reader.frame(last).fields).toEqual(other.frame(last).fields);
-  expect(reader.frame(last - 1).fields).toEqual(readStream(STREAM).frame(last - 1).fields);
-});
-
 test("frames that need a lost one are left out, and without any there is nothing to play", () => {
   const pieces = piecesOf(STREAM);
   const damaged = pieces.map((piece) => piece.slice());

@@ -62,14 +62,13 @@ test("fields that need others", () => {
   const without = (name: FieldName) => new Map([...coded].filter(([other]) => other !== name));
   expect(() => decodedFields(without("anchor_positions"), steps)).toThrow("too early in anchor_positions");
   expect(() => decodedFields(without("appearance"), steps)).toThrow("directions of an appearance without");
-  expect(() => decodedFields(new Map(coded).set("camera_color", varint(1)), steps)).toThrow("it has no coding");
   expect(() => decodedFields(coded, new Map())).toThrow("states no step for");
 });
 
 test("an environment has rows of three, one for each harmonic up to degree 0, 1 or 2", () => {
   const shapes = (rows: number) => () =>
     checkShapes(new Map([["environment", { shape: [rows, 3], data: new Float32Array(3 * rows) }]]), facts, "It");
-  const facts = { distanceInput: true, trainingCameras: 2 };
+  const facts = { distanceInput: true, cameras: [] };
   for (const rows of [1, 4, 9]) expect(shapes(rows)).not.toThrow();
   for (const rows of [0, 2, 16])
     expect(shapes(rows)).toThrow(`It has an environment of ${rows} rows; expected 1, 4 or 9.`);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Cameras as values: from a header, resized, directed at a point, or interpolated. */
 
-import type { StreamHeader } from "@structgstream/core";
+import type { Camera as HeaderCamera, StreamHeader } from "@structgstream/core";
 import { GlError } from "./errors.js";
 import type { Camera, Intrinsics } from "./types.js";
 import {
@@ -49,17 +49,23 @@ export function lookAt(eye: Vector, target: Vector, up: Vector): Float64Array {
   return viewmatOf(eye, [right, cross(forward, right), forward]);
 }
 
+/** @throws GlError the rig has no camera of this name */
+export function cameraNamed(header: StreamHeader, name: string): HeaderCamera {
+  const found = header.cameras.find((camera) => camera.name === name);
+  if (!found) {
+    const names = header.cameras.map((camera) => camera.name).join(", ");
+    throw new GlError(`The stream has no camera ${JSON.stringify(name)}; it has ${names}.`);
+  }
+  return found;
+}
+
 /**
  * A camera of the rig, in scene units.
  *
  * @throws GlError the rig has no camera of this name
  */
 export function rigCamera(header: StreamHeader, name: string): Camera {
-  const found = header.cameras.find((camera) => camera.name === name);
-  if (!found) {
-    const names = header.cameras.map((camera) => camera.name).join(", ");
-    throw new GlError(`The stream has no camera ${JSON.stringify(name)}; it has ${names}.`);
-  }
+  const found = cameraNamed(header, name);
   const { scale } = header.similarity;
   const viewmat = Float64Array.from(found.viewmat);
   for (const row of [0, 4, 8]) {

@@ -2,7 +2,7 @@
 /** The fields of a scene as tables of four numbers per texel, for the GLSL of `shaders/streamSplat.ts`. */
 
 import type { FieldName, Fields, Tensor } from "@structgstream/core";
-import { packedWeights, paddedRows } from "./gpu/weights.js";
+import { packedWeights, paddedRows, WEIGHT_FIELDS } from "./gpu/weights.js";
 import type { Shape } from "./scene.js";
 
 /** Names of samplers, and the fields that they contain. */
@@ -14,7 +14,7 @@ const TABLES = {
   features: ["anchor_features"],
   appearance: ["appearance"],
   free: ["free"],
-  weights: ["opacity_mlp", "color_mlp", "covariance_mlp", "appearance_basis"],
+  weights: WEIGHT_FIELDS,
 } as const satisfies Record<string, readonly FieldName[]>;
 
 export type TableName = keyof typeof TABLES;

@@ -23,7 +23,6 @@ export type {
   EyeView,
   Intrinsics,
   MlpPath,
-  Renderer,
   RendererOptions,
   RenderOptions,
   RenderStats,

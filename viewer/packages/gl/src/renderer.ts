@@ -2,17 +2,16 @@
 /** A canvas on which a stream's scenes are drawn. */
 
 import type { StreamHeader, Tensor } from "@structgstream/core";
-import { sameCamera } from "./cameraMath.js";
+import { cameraNamed, sameCamera } from "./cameraMath.js";
 import { GlError } from "./errors.js";
 import { type Device, deviceOf, openDevice } from "./gpu/device.js";
 import { Pace } from "./gpu/pace.js";
 import type { Look } from "./gpu/picturePass.js";
 import { Pipeline } from "./gpu/pipeline.js";
 import { LiveScene } from "./scene.js";
-import { Orders, type Sorted, sameWanted } from "./sorting/orders.js";
+import { Orders, type Sorted, sameWanted, type Wanted } from "./sorting/orders.js";
 import type {
   Camera,
-  Renderer,
   RendererOptions,
   RenderOptions,
   RenderStats,
@@ -22,7 +21,6 @@ import type {
 } from "./types.js";
 
 const MEAN_LOOK: Look = { gain: [1, 1, 1], bias: [0, 0, 0] };
-const BLACK = [0, 0, 0] as const;
 
 /** The content of the canvas. */
 interface Shown {
@@ -32,13 +30,16 @@ interface Shown {
   readonly look: Look;
 }
 
-export class SplatRenderer implements Renderer {
+/** After a lost context, `render` works again once the canvas has had its event `webglcontextrestored`. */
+export class SplatRenderer {
+  /** The next `render` can draw something new: an order has come, or the GPU is free again. */
   onOrder: (() => void) | undefined;
-  onContextLost: (() => void) | undefined;
-  onContextRestored: (() => void) | undefined;
+  /** An error after a call has returned, in the sorting worker or while a context was restored. */
   onError: ((error: Error) => void) | undefined;
-  maxSplats: number;
-  pixelScale: number;
+  /** Largest number of drawn splats, from the next `render` on; those of anchors with the smallest apparent size are left out. */
+  maxSplats = Number.POSITIVE_INFINITY;
+  /** Size of the drawn picture relative to the canvas, from the next `render` on; 0.5 draws a quarter of the pixels. */
+  pixelScale = 1;
   private device: Device;
   private pipeline: Pipeline | undefined;
   private readonly worker: Worker;
@@ -56,8 +57,6 @@ export class SplatRenderer implements Renderer {
     private readonly canvas: HTMLCanvasElement | OffscreenCanvas,
     private readonly options: RendererOptions = {},
   ) {
-    this.maxSplats = options.maxSplats ?? Number.POSITIVE_INFINITY;
-    this.pixelScale = options.pixelScale ?? 1;
     this.device = openDevice(canvas);
     this.pipeline = this.newPipeline();
     this.worker = workerOf(options.sorter);
@@ -67,26 +66,32 @@ export class SplatRenderer implements Renderer {
     canvas.addEventListener("webglcontextrestored", this.restored);
   }
 
-  get limitations(): readonly string[] {
-    return this.device.limitations;
-  }
-
   get resources(): ResourceCounts {
     const none = { textures: 0, buffers: 0, programs: 0, framebuffers: 0 };
     return { ...(this.pipeline?.counts ?? none), workers: this.destroyed ? 0 : 1 };
   }
 
+  /**
+   * Sets the static fields and removes an earlier stream; dynamic fields follow by `update`. If a stream `goesOn` with
+   * another header, its picture is shown until there is one of the new scene.
+   *
+   * @throws GlError the renderer was destroyed
+   */
   load(header: StreamHeader, goesOn = false): void {
     this.alive();
     this.scene = new LiveScene(header);
     this.orders.forget();
-    // The last picture is shown until there is one of the new scene.
     if (goesOn) return;
     this.sorted = undefined;
     this.shown = undefined;
     this.pipeline?.forget();
   }
 
+  /**
+   * Sets the dynamic fields. The latest scene is shown as soon as its order has come.
+   *
+   * @throws GlError there was no header, or the first update lacks fields
+   */
   update(update: SceneUpdate): void {
     this.alive();
     if (!this.scene) throw new GlError("An update came before a header; call load(header) first.");
@@ -96,26 +101,18 @@ export class SplatRenderer implements Renderer {
   render(camera: Camera, options: RenderOptions = {}): RenderStats {
     this.alive();
     const began = performance.now();
-    const snapshot = this.scene?.latest;
-    if (snapshot) this.orders.want({ snapshot, camera, maxSplats: this.maxSplats });
+    const wanted = this.want(camera);
     const look = this.lookNamed(options.cameraName);
     const drawn = this.pipeline ? this.drawn(this.pipeline, camera, look) : false;
-    const { sorted } = this;
-    const settled =
-      sorted !== undefined &&
-      snapshot !== undefined &&
-      this.pipeline !== undefined &&
-      sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats }) &&
-      this.shows(sorted, camera, look);
+    const settled = this.pipeline !== undefined && this.hasOrder(wanted) && this.shows(this.sorted, camera, look);
     return this.statsOf(drawn, settled, began);
   }
 
+  /** Draws the pictures of a headset, without waiting for the GPU; the canvas' own picture is not drawn. */
   renderViews({ eyes, middle, framebuffer, transparent }: Views): RenderStats {
     this.alive();
     const began = performance.now();
-    const snapshot = this.scene?.latest;
-    const wanted = snapshot && { snapshot, camera: middle, maxSplats: this.maxSplats };
-    if (wanted) this.orders.want(wanted);
+    const wanted = this.want(middle);
     const { pipeline } = this;
     if (pipeline) {
       this.takeOrder(pipeline);
@@ -126,10 +123,10 @@ export class SplatRenderer implements Renderer {
         pipeline.show(camera, MEAN_LOOK, { framebuffer, x, y, transparent });
       }
     }
-    const settled = wanted !== undefined && this.sorted !== undefined && sameWanted(this.sorted, wanted);
-    return this.statsOf(pipeline !== undefined, settled, began);
+    return this.statsOf(pipeline !== undefined, this.hasOrder(wanted), began);
   }
 
+  /** Draws until the picture is exact: of the last update, sorted for its camera. */
   async renderSettled(camera: Camera, options: RenderOptions = {}): Promise<RenderStats> {
     if (!this.scene?.latest) throw new GlError("There is no scene to draw yet; call update(frame) first.");
     for (;;) {
@@ -139,6 +136,7 @@ export class SplatRenderer implements Renderer {
     }
   }
 
+  /** The last rendered picture as PNG. */
   async screenshot(): Promise<Blob> {
     this.alive();
     if (!this.shown || !this.pipeline) throw new GlError("There is no picture to save yet; call render first.");
@@ -171,7 +169,7 @@ export class SplatRenderer implements Renderer {
   }
 
   private newPipeline(): Pipeline {
-    return new Pipeline(this.device, this.options.mlpPath, this.options.background ?? BLACK);
+    return new Pipeline(this.device, this.options.mlpPath);
   }
 
   private newOrders(): Orders {
@@ -203,6 +201,19 @@ export class SplatRenderer implements Renderer {
       sortMilliseconds: sorted?.order.milliseconds ?? 0,
       callMilliseconds: performance.now() - began,
     };
+  }
+
+  /** Requests the order of the present scene for a camera. */
+  private want(camera: Camera): Wanted | undefined {
+    const snapshot = this.scene?.latest;
+    const wanted = snapshot && { snapshot, camera, maxSplats: this.maxSplats };
+    if (wanted) this.orders.want(wanted);
+    return wanted;
+  }
+
+  /** Whether the order in which splats are drawn is the wanted one. */
+  private hasOrder(wanted: Wanted | undefined): boolean {
+    return wanted !== undefined && this.sorted !== undefined && sameWanted(this.sorted, wanted);
   }
 
   /** Takes the newest order, if one has come. */
@@ -241,15 +252,11 @@ export class SplatRenderer implements Renderer {
   /** Held-out cameras have no correction of their own and get the mean. */
   private lookNamed(name: string | undefined): Look {
     if (name === undefined || !this.scene) return MEAN_LOOK;
-    const { cameras } = this.scene.header;
-    const found = cameras.find((camera) => camera.name === name);
-    if (!found) {
-      const names = cameras.map((camera) => camera.name).join(", ");
-      throw new GlError(`The stream has no camera ${JSON.stringify(name)}; it has ${names}.`);
-    }
+    const { header } = this.scene;
+    const found = cameraNamed(header, name);
     const color = this.scene.latest?.fields.get("camera_color");
     if (found.heldOut || !color) return MEAN_LOOK;
-    return lookOf(color, cameras.filter((camera) => !camera.heldOut).indexOf(found));
+    return lookOf(color, header.cameras.filter((camera) => !camera.heldOut).indexOf(found));
   }
 
   private readonly lost = (event: Event): void => {
@@ -257,7 +264,6 @@ export class SplatRenderer implements Renderer {
     this.pace.stop();
     this.pipeline = undefined;
     this.shown = undefined;
-    this.onContextLost?.();
   };
 
   private readonly restored = (): void => {
@@ -270,7 +276,6 @@ export class SplatRenderer implements Renderer {
       this.onError?.(error instanceof Error ? error : new Error(String(error)));
       return;
     }
-    this.onContextRestored?.();
     this.settle();
   };
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The scene in the renderer: its present state, and the state for which an order was requested. */
 
-import { FIELD_NAMES, type FieldName, type Fields, type StreamHeader, type Tensor } from "@structgstream/core";
+import { FIELD_NAMES, type Fields, OPTIONAL_FIELDS, type StreamHeader } from "@structgstream/core";
 import { GlError } from "./errors.js";
 import { type TrainingCameras, trainingCamerasOf } from "./sampling.js";
 import type { SceneUpdate } from "./types.js";
@@ -31,8 +31,6 @@ export interface Shape {
   readonly distanceInput: boolean;
 }
 
-const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
-
 export function sizesOf(fields: Fields): Sizes {
   const [anchors, offsetsPerAnchor] = fields.get("anchor_offsets")!.shape as [number, number];
   return { anchors, offsetsPerAnchor, free: fields.get("free")!.shape[0]! };
@@ -58,30 +56,23 @@ export function sameShape(a: Shape, b: Shape): boolean {
 
 /** Collects updates and provides the present scene. */
 export class LiveScene {
-  private fields: Map<FieldName, Tensor>;
-  private found: Snapshot | undefined;
+  /** Undefined until an update has completed the scene. */
+  latest: Snapshot | undefined;
   private readonly training: TrainingCameras;
 
   constructor(readonly header: StreamHeader) {
-    this.fields = new Map(header.static);
     this.training = trainingCamerasOf(header);
-  }
-
-  /** Undefined until updates have completed the scene. */
-  get latest(): Snapshot | undefined {
-    return this.found;
   }
 
   /** @throws GlError the update lacks fields that no earlier update contained */
   apply(update: SceneUpdate): void {
-    const fields = new Map([...this.fields, ...update.fields]);
-    const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL.includes(name));
+    const fields = new Map([...(this.latest?.fields ?? this.header.static), ...update.fields]);
+    const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL_FIELDS.includes(name));
     if (missing.length) {
       throw new GlError(
         `The update of frame ${update.index} lacks ${missing.join(", ")}; expected every dynamic field in the first update.`,
       );
     }
-    this.fields = fields;
-    this.found = { index: update.index, ptsSeconds: update.ptsSeconds, fields, training: this.training };
+    this.latest = { index: update.index, ptsSeconds: update.ptsSeconds, fields, training: this.training };
   }
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Inputs and outputs of the renderer: its interface to the player. */
 
-import type { FieldName, StreamHeader, Tensor } from "@structgstream/core";
+import type { FieldName, Tensor } from "@structgstream/core";
 
 /**
  * The message of a decode worker for each frame. The arrays are transferred, never shared: the renderer stores them to
@@ -42,14 +42,8 @@ export type MlpPath = "transform-feedback" | "mrt";
 export interface RendererOptions {
   /** The sorting worker (`sorter.worker.ts`), or the URL of its module; the renderer terminates it. By default its own file. */
   readonly sorter?: Worker | URL;
-  /** Largest number of drawn splats; those of anchors with the smallest apparent size are left out. Default: no limit. */
-  readonly maxSplats?: number;
-  /** Size of the drawn picture relative to the canvas; 0.5 draws a quarter of the pixels. Default: 1. */
-  readonly pixelScale?: number;
   /** Default: the first path that the device supports, transform feedback before render targets. */
   readonly mlpPath?: MlpPath;
-  /** Background sRGB in [0, 1] of a scene without environment. Default: black, as in Python. */
-  readonly background?: readonly [number, number, number];
 }
 
 export interface RenderOptions {
@@ -103,36 +97,4 @@ export interface ResourceCounts {
   readonly programs: number;
   readonly framebuffers: number;
   readonly workers: number;
-}
-
-/** The interface of `SplatRenderer`. */
-export interface Renderer {
-  /** The next `render` can draw something new: an order has come, or the GPU is free again. */
-  onOrder: (() => void) | undefined;
-  onContextLost: (() => void) | undefined;
-  /** A context was restored; `render` works again. */
-  onContextRestored: (() => void) | undefined;
-  /** An error after a call has returned, in the sorting worker or while a context was restored. */
-  onError: ((error: Error) => void) | undefined;
-  /** Settable at any time; applies from the next `render` on. */
-  maxSplats: number;
-  pixelScale: number;
-  /**
-   * Sets the static fields and removes an earlier stream. Dynamic fields follow by `update`. If a stream `goesOn` with
-   * another header, its picture is shown until there is one of the new scene. Throws GlError.
-   */
-  load(header: StreamHeader, goesOn?: boolean): void;
-  /** Sets the dynamic fields. The latest scene is shown as soon as its order has come. Throws GlError. */
-  update(update: SceneUpdate): void;
-  render(camera: Camera, options?: RenderOptions): RenderStats;
-  /** Draws the pictures of a headset, without waiting for the GPU; the canvas' own picture is not drawn. */
-  renderViews(views: Views): RenderStats;
-  /** Draws until the picture is exact: of the last update, sorted for its camera. */
-  renderSettled(camera: Camera, options?: RenderOptions): Promise<RenderStats>;
-  /** The last rendered picture as PNG. */
-  screenshot(): Promise<Blob>;
-  readonly resources: ResourceCounts;
-  /** Sentences about limitations of this device; empty on most. */
-  readonly limitations: readonly string[];
-  destroy(): void;
 }

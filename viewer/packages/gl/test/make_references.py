@@ -24,6 +24,7 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 
 SIZES = (0.25, 0.5, 3.0)  # of the pictures that the stream was trained with
+HELD_OUT = 4  # cameras, at most
 COLUMNS = 11  # opacity, rgb, share of the largest scale (3), quaternion (4)
 
 
@@ -61,20 +62,18 @@ def nearer(camera: Camera, rig: CameraRig) -> Camera:
     return replace(camera, viewmat=viewmat, near=free_near(rig, eye))
 
 
-def views_of(
-    reader: StreamReader, *, frames: list[int] | None, held_out: int, on_arc: int
-) -> list[tuple[str, int, Camera]]:
+def views_of(reader: StreamReader, *, frames: list[int] | None, on_arc: int) -> list[tuple[str, int, Camera]]:
     """Name, frame and camera (capture's units) of every picture: held-out cameras, the first of them at
     other sizes and from half the distance, and an arc on which time runs."""
     rig, count = reader.header.rig, len(reader.packets)
     chosen = [0, count // 2, count - 1] if frames is None else frames
     views = [
         (f"camera-{name}-{frame}", frame, rig[name])
-        for name in rig.testing[:held_out]
+        for name in rig.testing[:HELD_OUT]
         for frame in dict.fromkeys(chosen)
     ]
-    if held_out > 0:
-        camera = rig[rig.testing[0]]
+    for name in rig.testing[:1]:
+        camera = rig[name]
         for size in SIZES:
             small = camera.resized(round(size * camera.width), round(size * camera.height))
             views.append((f"size-{size:g}-{chosen[0]}", chosen[0], small))
@@ -91,7 +90,6 @@ def main() -> None:
     parser.add_argument("stream", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, nargs="*", help="of held-out cameras; default: first, middle, last")
-    parser.add_argument("--held-out", type=int, default=4, help="how many held-out cameras")
     parser.add_argument("--arc", type=int, default=5, help="how many cameras on the arc")
     parser.add_argument("--outputs", type=int, default=2000, help="how many Gaussians' MLP outputs a view")
     options = parser.parse_args()
@@ -99,7 +97,7 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []
     outputs = b""
-    for name, frame, camera in views_of(reader, frames=options.frames, held_out=options.held_out, on_arc=options.arc):
+    for name, frame, camera in views_of(reader, frames=options.frames, on_arc=options.arc):
         scene, view = reader.scene(frame), reader.header.similarity.camera(camera)
         write_png(options.folder / f"{name}.png", rendered(scene, view, backend)[0])
         ids, values = outputs_of(scene, view, backend, options.outputs)

@@ -123,7 +123,8 @@ describe.skipIf(!executable)("in a browser", () => {
     const plain = cameras.map((camera): PlainCamera => ({ ...camera, viewmat: [...camera.viewmat] }));
     const found = await stage.page.evaluate(
       async ([views, rig, scale, frame]) => {
-        const play = await globalThis.stage.open("odd", { pixelScale: scale });
+        const play = await globalThis.stage.open("odd");
+        play.renderer.pixelScale = scale;
         if (rig) play.renderer.load({ ...play.reader.header!, cameras: rig });
         play.frame(frame);
         const all = [];

@@ -70,7 +70,7 @@ function scene(): Map<PlacingField, Float32Array<ArrayBuffer>> {
 
 function placed(): Placement {
   const placement = new Placement();
-  placement.set({ arrays: scene(), offsetsPerAnchor: K, freeColumns: 14, interval: INTERVAL });
+  placement.set(scene(), K, INTERVAL);
   return placement;
 }
 
@@ -126,7 +126,6 @@ test("an order names slots from far to near, each once, and none behind the near
     id: 1,
     changed: scene(),
     offsetsPerAnchor: K,
-    freeColumns: 14,
     interval: INTERVAL,
     camera: CAMERA,
     maxSplats: Number.POSITIVE_INFINITY,
@@ -150,7 +149,7 @@ test("an order names slots from far to near, each once, and none behind the near
 });
 
 test("a budget of free Gaussians alone draws no anchor", () => {
-  const sizes = { offsetsPerAnchor: K, freeColumns: 14, interval: INTERVAL };
+  const sizes = { offsetsPerAnchor: K, interval: INTERVAL };
   const request = { id: 1, changed: scene(), ...sizes, camera: CAMERA, buffers: [], maxSplats: 3 };
   const found = new Sorter().order(request);
   expect(found.anchorCount).toBe(0);

@@ -4,9 +4,7 @@ import type { FieldName, Tensor } from "@structgstream/core";
 import { expect, test } from "vitest";
 import { mlpLayout, packedWeights, paddedRows } from "../src/gpu/weights.ts";
 import { shapeOf } from "../src/scene.ts";
-import { splatRanges } from "../src/shaders/mlp.ts";
 import { cornerIndices, INDICES_PER_SPLAT, SPLATS_PER_CALL } from "../src/shaders/splat.ts";
-import { halfFloat } from "./support/halfFloat.ts";
 
 const [D, R, K, H] = [5, 2, 2, 6];
 
@@ -80,14 +78,6 @@ test("packed weights give what the MLP gives, with appearance as an input of its
   expect(packed.length).toBe(4 * layout.texels);
 });
 
-test("Gaussians of an anchor are shared out over as many passes as it takes", () => {
-  expect(splatRanges(7, 4)).toEqual([
-    { first: 0, count: 4 },
-    { first: 4, count: 3 },
-  ]);
-  expect(splatRanges(3, 5)).toEqual([{ first: 0, count: 3 }]);
-});
-
 test("no corner of a splat has the index that begins a new primitive", () => {
   const indices = cornerIndices();
   expect(indices.length).toBe(INDICES_PER_SPLAT * SPLATS_PER_CALL);
@@ -95,16 +85,4 @@ test("no corner of a splat has the index that begins a new primitive", () => {
   expect([...indices.slice(-INDICES_PER_SPLAT)].map((index) => index - 4 * (SPLATS_PER_CALL - 1))).toEqual([
     0, 1, 2, 2, 1, 3,
   ]);
-});
-
-test.each([
-  [0x0000, 0],
-  [0x3c00, 1],
-  [0xc000, -2],
-  [0x3555, 0.333251953125],
-  [0x0001, 2 ** -24],
-  [0x7bff, 65504],
-  [0x7c00, Number.POSITIVE_INFINITY],
-])("half float %i is %d", (bits, value) => {
-  expect(halfFloat(bits)).toBe(value);
 });

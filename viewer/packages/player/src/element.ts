@@ -2,19 +2,7 @@
 /**
  * `<structgstream-player src="stream.sgs">`
  *
- * | attribute | meaning |
- * |---|---|
- * | `src` | address of a stream, of a manifest of segments (`.json`), or `#id` of an element of the page that holds one as base64 |
- * | `autoplay`, `loop`, `poster`, `muted` | as for a video; without a gesture, browsers play pictures alone until there is one |
- * | `controls="off"` | no controls; the picture can still be turned |
- * | `embed` | few controls |
- * | `theme` | `dark` or `light`; default: that of the system |
- * | `truth` | address of a list of cameras with pictures, `truth.json`; pictures are at `truth/CAMERA/FRAME.jpg` next to it |
- * | `metres` | metres per unit of the capture, for headsets; default: `assumedMetres` of `xr/room.ts` |
- * | `isolated` | the player ignores the page's address (`?src=&t=&view=&embed=1`) |
- *
- * It dispatches the player's events by the same names, and those of a `<video>` (`mediaEvents.ts`); they do not bubble, and
- * `detail` has the event's data. Children are shown over the picture; those with `slot="controls"` in the bar.
+ * Attributes, members and events: docs/player.md. Events do not bubble, and `detail` has their data.
  */
 
 import { SOUND_RATE } from "@structgstream/core";
@@ -25,6 +13,7 @@ import { startedPipeline } from "./pipeline.js";
 import { Player, type PlayerEvents } from "./player.js";
 import { startedWorker } from "./scripts.js";
 import type { SourceDescription } from "./source/description.js";
+import { made } from "./ui/dom.js";
 import { PlayerUi } from "./ui/playerUi.js";
 import { STYLES } from "./ui/styles.js";
 import { type Link, linkOf, viewFrom } from "./view/link.js";
@@ -379,9 +368,8 @@ export class StructgstreamPlayer extends HTMLElement {
 
   private start(): void {
     const root = this.shadowRoot ?? this.attachShadow({ mode: "open", delegatesFocus: true });
-    const style = document.createElement("style");
-    style.textContent = STYLES;
-    const canvas = document.createElement("canvas");
+    const style = made("style", {}, STYLES);
+    const canvas = made("canvas");
     const quality = new QualityControl(deviceOf(navigator));
     let player: Player;
     try {
@@ -436,14 +424,9 @@ export class StructgstreamPlayer extends HTMLElement {
 
   /** Shows that there is no WebGL2. */
   private startWithout(root: ShadowRoot, style: Node, error: unknown): void {
-    const text = document.createElement("p");
-    text.textContent = error instanceof Error ? error.message : String(error);
-    text.setAttribute("role", "alert");
-    const middle = document.createElement("div");
-    middle.className = "middle bad";
-    middle.append(text);
-    root.replaceChildren(style, middle);
-    this.dispatch("error", { message: text.textContent, fatal: true });
+    const message = error instanceof Error ? error.message : String(error);
+    root.replaceChildren(style, made("div", { class: "middle bad" }, made("p", { role: "alert" }, message)));
+    this.dispatch("error", { message, fatal: true });
   }
 
   private readonly dispatch = (name: string, detail: unknown): void => {
@@ -507,7 +490,7 @@ export class StructgstreamPlayer extends HTMLElement {
   };
 
   private applyAttributes(ui: PlayerUi): void {
-    ui.controls = this.getAttribute("controls") !== "off";
+    ui.controls = this.controls;
     ui.embed = this.hasAttribute("embed") || this.link?.embed === true;
     ui.poster = this.poster === "" ? undefined : new URL(this.poster, document.baseURI).href;
   }
@@ -535,7 +518,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const token = this.token();
     // The page's token also opens its streams; it is not sent to other hosts.
     if (own && token !== null && !url.searchParams.has("token")) url.searchParams.set("token", token);
-    const found = { url: url.href, name: nameOf(url.href), sameOrigin };
+    const found = { url: url.href, name: nameOf(url), sameOrigin };
     return url.pathname.endsWith(".json") ? { kind: "segments", own, ...found } : { kind: "url", ...found };
   }
 
@@ -578,10 +561,7 @@ export class StructgstreamPlayer extends HTMLElement {
   private async save(): Promise<void> {
     try {
       const url = URL.createObjectURL(await this.screenshot());
-      const anchor = document.createElement("a");
-      anchor.href = url;
-      anchor.download = `frame-${this.running?.player.stats?.frameIndex ?? 0}.png`;
-      anchor.click();
+      made("a", { href: url, download: `frame-${this.running?.player.stats?.frameIndex ?? 0}.png` }).click();
       setTimeout(() => URL.revokeObjectURL(url), 10_000);
     } catch (error) {
       this.running?.ui.say(error instanceof Error ? error.message : String(error), true);
@@ -589,11 +569,8 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 }
 
-function nameOf(url: string): string {
-  return decodedName(new URL(url).pathname.split("/").at(-1) ?? "") || "The stream";
-}
-
-function decodedName(name: string): string {
+function nameOf(url: URL): string {
+  const name = url.pathname.split("/").at(-1) || "The stream";
   try {
     return decodeURIComponent(name);
   } catch {

@@ -6,9 +6,9 @@ import {
   type Camera,
   center,
   fitted,
-  type Renderer,
   type RenderStats,
   type ResourceCounts,
+  type SplatRenderer,
   type Views,
 } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
@@ -37,7 +37,7 @@ export interface HeadsetViews extends Views {
 }
 
 export interface PlayerOptions {
-  readonly renderer: Renderer;
+  readonly renderer: SplatRenderer;
   readonly quality: QualityControl;
   readonly startPipeline: () => Pipeline;
   /** Seconds of a monotonic clock. */
@@ -105,7 +105,7 @@ export class Player extends Emitter<PlayerEvents> {
   /** Opens a stream and closes the last one. `view` is set once the rig is known. */
   load(source: SourceDescription, startSeconds?: number, view?: (rig: Rig) => View): Engine {
     this.engine?.destroy();
-    const engine = new Engine(this.options.startPipeline(), this.sound.now, { sound: this.sound });
+    const engine = new Engine(this.options.startPipeline(), this.sound.now, this.sound);
     this.engine = engine;
     this.rig = undefined;
     this.flight = undefined;
@@ -288,13 +288,7 @@ export class Player extends Emitter<PlayerEvents> {
   private begin(header: StreamHeader, view: ((rig: Rig) => View) | undefined): void {
     const rig = rigOf(header);
     this.rig = rig;
-    try {
-      this.options.renderer.load(header);
-    } catch (error) {
-      this.engine?.destroy();
-      this.emit("error", { message: error instanceof Error ? error.message : String(error), fatal: true });
-      return;
-    }
+    this.options.renderer.load(header);
     this.setView(view ? view(rig) : viewOf(rig.first.camera, rig.focus));
     this.atCamera = view ? undefined : rig.first;
     this.emit("header", header);

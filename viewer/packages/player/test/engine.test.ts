@@ -1,28 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Engine, decoder and fetcher together, without a browser. */
 
-import { readStream, type Tensor } from "@structgstream/core";
+import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
-import { expectSame } from "../../core/test/streams.ts";
+import { record } from "../../core/test/streams.ts";
 import type { FromDecoder } from "../src/decode/messages.ts";
 import { Engine } from "../src/engine/engine.ts";
 import type { Pipeline } from "../src/engine/pipeline.ts";
-import { CLIP, playing, playingFile, ServedFile } from "./served.ts";
+import { CLIP, expectClip, playing, playingFile, ServedFile } from "./served.ts";
 
 vi.setConfig({ testTimeout: 60_000 });
 
 const WHOLE = readStream(CLIP);
 const PACKETS = WHOLE.packets;
 const KEYS = PACKETS.filter(({ isKey }) => isKey).map(({ index }) => index);
-
-/** Whether what was given, update after update, adds up to a frame of the file. */
-function expectFrame(fields: Map<string, Tensor>, index: number): void {
-  const expected = readStream(CLIP).frame(index).fields;
-  for (const name of WHOLE.header!.dynamic) {
-    expect(fields.get(name)?.shape).toEqual(expected.get(name)!.shape);
-    expectSame(fields.get(name), expected.get(name)!);
-  }
-}
 
 test("the clip has groups", () => {
   expect(KEYS).toEqual([0, 3, 6, 9]);
@@ -60,12 +51,7 @@ test("seeking back and forth gives exact frames and fetches what is not there", 
   const play = playingFile(file);
   await play.settled();
   const before = file.requests.length;
-  const fields = new Map<string, Tensor>();
-  for (const index of [7, 1, 11, 5, 7, 0]) {
-    play.engine.seekFrame(index);
-    await play.given(index, fields);
-    expectFrame(fields, index);
-  }
+  for (const index of [7, 1, 11, 5, 7, 0]) await play.seeksExactly(index);
   expect(file.requests.slice(before)).toEqual([
     [PACKETS[6]!.offset, PACKETS[8]!.offset],
     [PACKETS[1]!.offset, PACKETS[2]!.offset],
@@ -77,16 +63,12 @@ test("seeking back and forth gives exact frames and fetches what is not there", 
 test("a seek that is overtaken by another loses no field", async () => {
   const play = playingFile(new ServedFile(CLIP));
   await play.settled();
-  const fields = new Map<string, Tensor>();
   for (const index of [4, 10, 2, 8]) {
     play.engine.seekFrame(index);
     await new Promise((resolve) => setTimeout(resolve, index));
   }
-  await play.given(8, fields);
-  // What an update leaves out is what the first frame had, which was taken before.
-  const first = readStream(CLIP).frame(0).fields;
-  for (const [name, tensor] of first) if (!fields.has(name)) fields.set(name, tensor);
-  expectFrame(fields, 8);
+  await play.until(() => play.shown.at(-1) === 8);
+  expectClip(play, 8);
 });
 
 test("plays to the end, every frame in order, and again from the start", async () => {
@@ -220,7 +202,7 @@ test("steps", async () => {
 
 test("a starved clock waits with the last frame, and says so", async () => {
   const file = new ServedFile(CLIP);
-  const play = playingFile(file, 0, { aheadSeconds: 0.01 });
+  const play = playingFile(file);
   await play.settled();
   const stalls: boolean[] = [];
   play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
@@ -337,7 +319,6 @@ describe("a growing file", () => {
 });
 
 test("frames that a live run skipped take their time, also in a file with an index", async () => {
-  const { record } = await import("../../core/test/streams.ts");
   const bytes = CLIP.slice();
   for (const { index, isKey, offset, bytes: size } of PACKETS) {
     const payload = bytes.slice(offset + 8, offset + size - 4);
@@ -378,7 +359,6 @@ describe("damage", () => {
   });
 
   test("of a packet's contents behind a right checksum costs its group", async () => {
-    const { record } = await import("../../core/test/streams.ts");
     const bytes = CLIP.slice();
     const { offset, bytes: size } = PACKETS[4]!;
     const payload = bytes.slice(offset + 8, offset + size - 4);
@@ -468,16 +448,4 @@ test("what a packet took is known by field", async () => {
   const facts = play.engine.packets.of(4)!;
   expect(facts.bytes).toBe(PACKETS[4]!.bytes);
   expect([...facts.byField.values()].reduce((sum, bytes) => sum + bytes, 24)).toBe(facts.bytes);
-});
-
-test("a refresh has every dynamic field", async () => {
-  const play = playingFile(new ServedFile(CLIP));
-  await play.settled();
-  play.engine.refresh();
-  let fields: string[] = [];
-  for (let i = 0; i < 500 && fields.length === 0; i++) {
-    fields = [...(play.engine.tick()?.fields.keys() ?? [])];
-    await new Promise((resolve) => setTimeout(resolve, 1));
-  }
-  expect(new Set(fields)).toEqual(WHOLE.header!.dynamic);
 });

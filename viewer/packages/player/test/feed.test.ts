@@ -149,6 +149,11 @@ test("a host that never answers is given up for this time", async () => {
   expect(log.join()).toContain("The server has not answered the request for m.json for 45 s.");
 });
 
+test("a manifest without an end is not read on", async () => {
+  const { log } = await followed(5, true, () => new Response(new Uint8Array(2 ** 22 + 1)));
+  expect(log).toEqual(["failed: m.json has more than 4194304 bytes, which no manifest has."]);
+});
+
 test("the first manifest must be one", async () => {
   const { log, asked } = await followed(5, true, () => new Response("", { status: 404 }));
   expect(log).toEqual(["failed: m.json was not found on the server (404). Check the address."]);

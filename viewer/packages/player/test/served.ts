@@ -2,12 +2,13 @@
 /** Streams as tests see them: a server that is a function, and an engine with its workers in this very thread. */
 
 import { readFileSync } from "node:fs";
-import type { Tensor } from "@structgstream/core";
+import { type FieldName, readStream, type Tensor } from "@structgstream/core";
 import { afterEach } from "vitest";
+import { expectSame } from "../../core/test/streams.ts";
 import { Decoding } from "../src/decode/decoding.ts";
 import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
 import { Engine } from "../src/engine/engine.ts";
-import type { EngineOptions } from "../src/engine/options.ts";
+import type { Sound } from "../src/sound/sound.ts";
 import type { ReadReply, ReadRequest } from "../src/source/description.ts";
 import { Fetcher } from "../src/source/fetcher.ts";
 import type { Port } from "../src/source/port.ts";
@@ -91,6 +92,10 @@ export interface Playing {
   readonly notices: string[];
   /** Frames given by `tick`, in order. */
   readonly shown: number[];
+  /** Those that came with another header. */
+  readonly headers: number[];
+  /** What was given adds up to these, since the last header. */
+  readonly fields: Map<FieldName, Tensor>;
   seconds: number;
   /** Decoded frames do not reach the engine until the function that it gives back is called. */
   holdFrames(): () => void;
@@ -100,9 +105,15 @@ export interface Playing {
   settled(): Promise<void>;
   /** Plays on to the end, so many seconds a tick. */
   toEnd(step?: number): Promise<void>;
-  /** Ticks until a frame is given, and takes what is given into `fields`. */
-  given(index: number, fields: Map<string, Tensor>): Promise<void>;
+  /** Seeks to a frame of the clip, and compares what is given with it. */
+  seeksExactly(index: number): Promise<void>;
   close(): void;
+}
+
+export interface PlayingOptions {
+  /** Of stored packets. */
+  readonly budgetBytes?: number;
+  readonly sound?: Sound;
 }
 
 let open: Playing[] = [];
@@ -112,20 +123,28 @@ afterEach(() => {
   open = [];
 });
 
+/** Compares what was given with a frame of the clip. */
+export function expectClip({ fields }: Playing, index: number): void {
+  const reader = readStream(CLIP);
+  const expected = reader.frame(index).fields;
+  for (const name of reader.header!.dynamic) expectSame(fields.get(name), expected.get(name)!);
+}
+
 /** An engine that opens a file, which is closed after the test. */
-export function playingFile(file: ServedFile, startSeconds = 0, options: EngineOptions = {}): Playing {
+export function playingFile(file: ServedFile, startSeconds = 0, options: PlayingOptions = {}): Playing {
   const play = playing(file.fetch as typeof fetch, options);
   play.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
   return play;
 }
 
-export function playing(request: typeof fetch, options: EngineOptions = {}): Playing {
+export function playing(request: typeof fetch, options: PlayingOptions = {}): Playing {
   const [engineLine, fetchLine] = [new MessageChannel(), new MessageChannel()];
   new Fetcher(fetchLine.port1 as unknown as Port<ReadReply, ReadRequest>, request, QUICK);
   new Decoding(
     engineLine.port1 as unknown as Port<FromDecoder, ToDecoder>,
     fetchLine.port2 as unknown as Port<ReadRequest, ReadReply>,
     () => new Promise((resolve) => setImmediate(resolve)),
+    options.budgetBytes,
   );
   const pipeline = {
     onmessage: undefined as ((message: FromDecoder) => void) | undefined,
@@ -143,10 +162,12 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     else pipeline.onmessage?.(data);
   };
   const found: Playing = {
-    engine: new Engine(pipeline, () => found.seconds, options),
+    engine: new Engine(pipeline, () => found.seconds, options.sound),
     errors: [],
     notices: [],
     shown: [],
+    headers: [],
+    fields: new Map(),
     seconds: 100,
     async until(reached, what = "what was waited for") {
       const give = performance.now() + 50_000;
@@ -174,17 +195,24 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
         return found.engine.ended;
       }, "end");
     },
-    async given(index, fields) {
-      for (let last = -1; last !== index; ) {
-        const update = found.engine.tick();
-        for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
-        last = update?.index ?? last;
-        await new Promise((resolve) => setTimeout(resolve, 1));
-      }
+    async seeksExactly(index) {
+      found.engine.seekFrame(index);
+      await found.until(() => !found.engine.seeking && found.shown.at(-1) === index, `frame ${index}`);
+      expectClip(found, index);
     },
     close: () => found.engine.destroy(),
   };
   open.push(found);
+  const tick = found.engine.tick.bind(found.engine);
+  found.engine.tick = () => {
+    const update = tick();
+    if (update?.header) {
+      found.headers.push(update.index);
+      found.fields.clear();
+    }
+    for (const [name, tensor] of update?.fields ?? []) found.fields.set(name, tensor);
+    return update;
+  };
   found.engine.on("error", ({ message }) => found.errors.push(message));
   found.engine.on("notice", ({ message }) => found.notices.push(message));
   found.engine.on("frame", ({ index }) => found.shown.push(index));

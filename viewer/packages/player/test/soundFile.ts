@@ -5,15 +5,10 @@ import { HEAD_BYTES, RecordType, viewOf } from "../../core/src/records.ts";
 import { bytesOf, type IndexRow, indexOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
 
 export const FPS = 12;
-/** In each second, of the clap and of the white picture. */
-export const CLAP_SECONDS = 0.5;
-export const CLAP_FRAME = 6;
 
-export const SOUND_VECTOR = bytesOf(VECTORS, "version-2-sound.sgs");
-
-/** Prefix and init record, and each frame's packet and sound record, of so many seconds. */
-export function clapping(seconds: number): { head: Uint8Array; frames: (readonly [Uint8Array, Uint8Array])[] } {
-  const [prefix, init, ...pieces] = piecesOf(SOUND_VECTOR);
+/** A file of so many seconds, each frame with its sound record, and with its index. */
+export function clappingFile(seconds: number): Uint8Array {
+  const [prefix, init, ...pieces] = piecesOf(bytesOf(VECTORS, "version-2-sound.sgs"));
   const frames: (readonly [Uint8Array, Uint8Array])[] = [];
   for (let second = 0; second < seconds; second++) {
     for (let frame = 0; frame < FPS; frame++) {
@@ -28,12 +23,7 @@ export function clapping(seconds: number): { head: Uint8Array; frames: (readonly
       frames.push([record(pieces[2 * frame]![0]!, packet), record(RecordType.sound, sound)]);
     }
   }
-  return { head: joined(prefix!, init!), frames };
-}
-
-/** A file of so many seconds, with its index. */
-export function clappingFile(seconds: number): Uint8Array {
-  const { head, frames } = clapping(seconds);
+  const head = joined(prefix!, init!);
   let at = head.length;
   const entries = frames.map(([packet, sound], index): IndexRow => {
     const offset = at;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The context, the capabilities of this device, and sentences about its limitations. */
+/** The context, and the capabilities of this device. */
 
 import { GlError } from "../errors.js";
 import type { MlpPath } from "../types.js";
@@ -11,14 +11,12 @@ export const PAIR_TARGETS = 3;
 
 export interface Device {
   readonly gl: WebGL2RenderingContext;
-  /** Format of the texture into which splats are blended. */
-  readonly accumulation: { readonly format: "RGBA16F" | "RGBA8" };
+  /** Format of the texture into which splats are blended; in 8 bits soft gradients may show steps. */
+  readonly blendFormat: "RGBA16F" | "RGBA8";
   readonly maxTextureSize: number;
   readonly maxLayers: number;
   /** Splats of an anchor that one pass can compute, by path; 0 if the device does not support the path. */
   readonly splatsPerPass: Readonly<Record<MlpPath, number>>;
-  /** Sentences about limitations of the rendering on this device. */
-  readonly limitations: readonly string[];
 }
 
 /** @throws GlError this browser or device has no WebGL2 */
@@ -41,16 +39,9 @@ export function openDevice(canvas: HTMLCanvasElement | OffscreenCanvas): Device 
 /** Capabilities of a context; called again after a context was restored, because extensions must be enabled again. */
 export function deviceOf(gl: WebGL2RenderingContext): Device {
   const float = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
-  const limitations: string[] = [];
-  if (!float) {
-    limitations.push(
-      "This device cannot draw into floating-point textures (EXT_color_buffer_float): splats are blended in 8 bits, and soft " +
-        "gradients may show steps.",
-    );
-  }
   return {
     gl,
-    accumulation: { format: float ? "RGBA16F" : "RGBA8" },
+    blendFormat: float ? "RGBA16F" : "RGBA8",
     maxTextureSize: limit(gl, gl.MAX_TEXTURE_SIZE),
     maxLayers: limit(gl, gl.MAX_ARRAY_TEXTURE_LAYERS),
     splatsPerPass: {
@@ -63,7 +54,6 @@ export function deviceOf(gl: WebGL2RenderingContext): Device {
       ),
       mrt: 2 * Math.floor(Math.min(limit(gl, gl.MAX_DRAW_BUFFERS), limit(gl, gl.MAX_COLOR_ATTACHMENTS)) / PAIR_TARGETS),
     },
-    limitations,
   };
 }
 

@@ -4,7 +4,7 @@
 import { GlError } from "../errors.js";
 import type { Shape } from "../scene.js";
 import { feedbackProgram, type SplatRange, splatRanges } from "../shaders/mlp.js";
-import { readingGlsl } from "../shaders/reading.js";
+import { feedbackReading } from "../shaders/reading.js";
 import type { Vector } from "../vectors.js";
 import { bindInputs } from "./binding.js";
 import { type Device, SPLAT_VECTORS } from "./device.js";
@@ -30,10 +30,10 @@ export class FeedbackPass implements MlpPass {
     private readonly resources: Resources,
     private readonly device: Device,
     shape: Shape,
-    private readonly most: number,
+    most: number,
   ) {
     const splats = shape.offsetsPerAnchor;
-    this.reading = readingGlsl("transform-feedback", splats, most);
+    this.reading = feedbackReading(splats, most);
     const layout = mlpLayout(shape);
     this.passes = splatRanges(splats, most).map((range) => ({
       range,
@@ -76,7 +76,7 @@ export class FeedbackPass implements MlpPass {
     if (count <= this.room) return;
     const { gl } = this.resources;
     const { maxTextureSize } = this.device;
-    const perAnchor = Math.min(this.most, this.passes[0]!.range.count) * SPLAT_VECTORS;
+    const perAnchor = this.passes[0]!.range.count * SPLAT_VECTORS;
     const rowsFor = (anchors: number) => Math.ceil((anchors * perAnchor) / WIDTH);
     const wanted = this.room ? Math.ceil(1.25 * count) : count;
     this.room = rowsFor(wanted) * this.passes.length <= maxTextureSize ? wanted : count;
@@ -88,8 +88,8 @@ export class FeedbackPass implements MlpPass {
           `texture, which has at most ${maxTextureSize}; set maxSplats.`,
       );
     }
-    if (this.buffer) this.resources.deleteBuffer(this.buffer);
-    if (this.texture) this.resources.deleteTexture(this.texture);
+    if (this.buffer) this.resources.delete(this.buffer);
+    if (this.texture) this.resources.delete(this.texture);
     this.buffer = this.resources.buffer();
     gl.bindBuffer(gl.TRANSFORM_FEEDBACK_BUFFER, this.buffer);
     gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, this.passRows * WIDTH * VECTOR_BYTES, gl.DYNAMIC_COPY);

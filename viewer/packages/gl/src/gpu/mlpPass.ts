@@ -6,7 +6,7 @@ import type { SceneTextures } from "./sceneTextures.js";
 
 /** Evaluates the MLPs of the visible anchors and stores their outputs. */
 export interface MlpPass {
-  /** GLSL that reads it (`readingGlsl`). */
+  /** GLSL that reads it (`shaders/reading.ts`). */
   readonly reading: string;
   /** @throws GlError the device has not enough memory for the visible anchors */
   evaluate(scene: SceneTextures, eye: Vector): void;

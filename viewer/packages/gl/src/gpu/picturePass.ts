@@ -30,15 +30,11 @@ export class PicturePass {
 
   constructor(private readonly resources: Resources) {}
 
-  /**
-   * @param environment [E, 3], empty without one
-   * @param background colour behind everything if there is no environment
-   */
+  /** @param environment [E, 3], empty without one */
   draw(
     blended: WebGLTexture,
     camera: Camera,
     environment: Float32Array,
-    background: readonly [number, number, number],
     look: Look,
     { framebuffer, x, y, transparent }: Target,
   ): void {
@@ -50,7 +46,6 @@ export class PicturePass {
     gl.uniform1i(program.at("transparent"), Number(transparent));
     gl.uniform3f(program.at("gain"), ...look.gain);
     gl.uniform3f(program.at("bias"), ...look.bias);
-    gl.uniform3f(program.at("background"), ...background);
     if (environment.length) gl.uniform3fv(program.at("environment"), environment);
     gl.uniformMatrix3fv(program.at("rays"), true, rays(camera));
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
@@ -62,7 +57,7 @@ export class PicturePass {
 
   private programFor(rows: number): Program {
     if (this.program && rows === this.rows) return this.program;
-    if (this.program) this.resources.deleteProgram(this.program.handle);
+    if (this.program) this.resources.delete(this.program.handle);
     this.program = this.resources.program(pictureProgram(rows));
     this.rows = rows;
     return this.program;

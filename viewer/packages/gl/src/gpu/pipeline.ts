@@ -5,7 +5,7 @@ import type { Fields } from "@structgstream/core";
 import { center, resized } from "../cameraMath.js";
 import { type Shape, sameShape, shapeOf } from "../scene.js";
 import type { Sorted } from "../sorting/orders.js";
-import type { Camera, MlpPath, ResourceCounts } from "../types.js";
+import type { Camera, MlpPath } from "../types.js";
 import { chosenPath, type Device } from "./device.js";
 import { FeedbackPass } from "./feedbackPass.js";
 import type { MlpPass } from "./mlpPass.js";
@@ -43,7 +43,6 @@ export class Pipeline {
   constructor(
     readonly device: Device,
     askedPath: MlpPath | undefined,
-    private readonly background: readonly [number, number, number],
   ) {
     this.path = chosenPath(device, askedPath);
     this.resources = new Resources(device.gl);
@@ -80,7 +79,7 @@ export class Pipeline {
     this.fields = undefined;
   }
 
-  get counts(): Omit<ResourceCounts, "workers"> {
+  get counts(): Resources["counts"] {
     const [own, stage] = [this.resources.counts, this.ofStage.counts];
     return {
       textures: own.textures + stage.textures,
@@ -112,7 +111,7 @@ export class Pipeline {
   show(camera: Camera, look: Look, target = CANVAS): void {
     const environment = this.fields?.get("environment")?.data as Float32Array | undefined;
     if (!this.splats.target) return;
-    this.picture.draw(this.splats.target, camera, environment ?? NOTHING, this.background, look, target);
+    this.picture.draw(this.splats.target, camera, environment ?? NOTHING, look, target);
   }
 
   private stageFor(shape: Shape): Stage {

@@ -35,49 +35,44 @@ export class Program {
   }
 }
 
+type Kind = Exclude<keyof ResourceCounts, "workers">;
+
 export class Resources {
-  private readonly textures = new Set<WebGLTexture>();
-  private readonly buffers = new Set<WebGLBuffer>();
-  private readonly programs = new Set<WebGLProgram>();
-  private readonly framebuffers = new Set<WebGLFramebuffer>();
-  private readonly feedbacks = new Set<WebGLTransformFeedback>();
-  private readonly arrays = new Set<WebGLVertexArrayObject>();
+  /** Each resource, its kind and how it is deleted. */
+  private readonly living = new Map<object, readonly [kind: Kind, free: () => void]>();
 
   constructor(readonly gl: WebGL2RenderingContext) {}
 
-  get counts(): Omit<ResourceCounts, "workers"> {
-    return {
-      textures: this.textures.size,
-      buffers: this.buffers.size + this.feedbacks.size + this.arrays.size,
-      programs: this.programs.size,
-      framebuffers: this.framebuffers.size,
-    };
+  get counts(): Record<Kind, number> {
+    const counts = { textures: 0, buffers: 0, programs: 0, framebuffers: 0 };
+    for (const [kind] of this.living.values()) counts[kind]++;
+    return counts;
   }
 
   texture(): WebGLTexture {
-    return kept(this.textures, this.gl.createTexture());
+    return this.kept("textures", this.gl.createTexture(), (made) => this.gl.deleteTexture(made));
   }
 
   buffer(): WebGLBuffer {
-    return kept(this.buffers, this.gl.createBuffer());
+    return this.kept("buffers", this.gl.createBuffer(), (made) => this.gl.deleteBuffer(made));
   }
 
   framebuffer(): WebGLFramebuffer {
-    return kept(this.framebuffers, this.gl.createFramebuffer());
+    return this.kept("framebuffers", this.gl.createFramebuffer(), (made) => this.gl.deleteFramebuffer(made));
   }
 
   feedback(): WebGLTransformFeedback {
-    return kept(this.feedbacks, this.gl.createTransformFeedback());
+    return this.kept("buffers", this.gl.createTransformFeedback(), (made) => this.gl.deleteTransformFeedback(made));
   }
 
   vertexArray(): WebGLVertexArrayObject {
-    return kept(this.arrays, this.gl.createVertexArray());
+    return this.kept("buffers", this.gl.createVertexArray(), (made) => this.gl.deleteVertexArray(made));
   }
 
   /** @throws GlError the driver rejects the program; a lost context returns one that does nothing */
   program(source: ProgramSource): Program {
     const { gl } = this;
-    const handle = kept(this.programs, gl.createProgram());
+    const handle = this.kept("programs", gl.createProgram(), (made) => gl.deleteProgram(made));
     for (const [type, text] of [
       [gl.VERTEX_SHADER, source.vertex],
       [gl.FRAGMENT_SHADER, source.fragment],
@@ -100,36 +95,20 @@ export class Resources {
     return new Program(gl, handle);
   }
 
-  deleteTexture(texture: WebGLTexture): void {
-    if (this.textures.delete(texture)) this.gl.deleteTexture(texture);
-  }
-
-  deleteBuffer(buffer: WebGLBuffer): void {
-    if (this.buffers.delete(buffer)) this.gl.deleteBuffer(buffer);
-  }
-
-  deleteProgram(program: WebGLProgram): void {
-    if (this.programs.delete(program)) this.gl.deleteProgram(program);
+  delete(resource: object): void {
+    this.living.get(resource)?.[1]();
+    this.living.delete(resource);
   }
 
   deleteAll(): void {
-    const { gl } = this;
-    for (const texture of this.textures) gl.deleteTexture(texture);
-    for (const buffer of this.buffers) gl.deleteBuffer(buffer);
-    for (const program of this.programs) gl.deleteProgram(program);
-    for (const framebuffer of this.framebuffers) gl.deleteFramebuffer(framebuffer);
-    for (const feedback of this.feedbacks) gl.deleteTransformFeedback(feedback);
-    for (const array of this.arrays) gl.deleteVertexArray(array);
-    for (const set of [this.textures, this.buffers, this.programs, this.framebuffers, this.feedbacks, this.arrays]) {
-      set.clear();
-    }
+    for (const resource of this.living.keys()) this.delete(resource);
   }
-}
 
-/** A lost context may return null, and ignores it as an argument. */
-function kept<T>(set: Set<T>, made: T | null): T {
-  if (made !== null) set.add(made);
-  return made as T;
+  /** A lost context may return null, and ignores it as an argument. */
+  private kept<Resource extends object>(kind: Kind, made: Resource | null, free: (made: Resource) => void): Resource {
+    if (made !== null) this.living.set(made, [kind, () => free(made)]);
+    return made as Resource;
+  }
 }
 
 function refused(log: string | null): GlError {

@@ -7,10 +7,7 @@ import type { Order } from "../sorting/messages.js";
 import type { Device } from "./device.js";
 import type { Resources } from "./resources.js";
 import { Table, type TexelFormat } from "./table.js";
-import { packedWeights, paddedRows } from "./weights.js";
-
-/** Fields that contain the weights. */
-const MLP_FIELDS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp", "appearance_basis"];
+import { packedWeights, paddedRows, WEIGHT_FIELDS } from "./weights.js";
 
 /** By the names of the shaders' samplers: the format of a table, and its name in messages. */
 const TABLES = {
@@ -63,7 +60,7 @@ export class SceneTextures {
     if (shape.appearance && changed("appearance")) {
       tables.appearance.write(paddedRows(floats("appearance"), shape.appearance));
     }
-    if (MLP_FIELDS.some(changed)) tables.weights.write(packedWeights(fields, shape));
+    if (WEIGHT_FIELDS.some(changed)) tables.weights.write(packedWeights(fields, shape));
     for (const [name, tensor] of fields) this.written.set(name, tensor);
     this.sizes = sizesOf(fields);
     tables.anchors.write(order.anchors, order.anchorCount);

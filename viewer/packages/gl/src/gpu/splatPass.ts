@@ -66,10 +66,10 @@ export class SplatPass {
   private resize(width: number, height: number): void {
     if (this.target && width === this.width && height === this.height) return;
     const { gl } = this.resources;
-    if (this.target) this.resources.deleteTexture(this.target);
+    if (this.target) this.resources.delete(this.target);
     this.target = plainTexture(this.resources);
     [this.width, this.height] = [width, height];
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl[this.device.accumulation.format], width, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl[this.device.blendFormat], width, height);
     // Displayed larger than it is drawn if the resolution is scaled down.
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);

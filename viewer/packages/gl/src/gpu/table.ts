@@ -44,7 +44,7 @@ export class Table {
     }
     if (this.texture && rows <= this.rows) return;
     const { gl } = this.resources;
-    if (this.texture) this.resources.deleteTexture(this.texture);
+    if (this.texture) this.resources.delete(this.texture);
     this.rows = this.texture ? Math.min(Math.ceil(rows * ROOM), maxTextureSize) : rows;
     this.texture = plainTexture(this.resources);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl[this.format], WIDTH, this.rows);

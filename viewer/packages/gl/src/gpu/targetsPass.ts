@@ -4,7 +4,7 @@
 import { GlError } from "../errors.js";
 import type { Shape } from "../scene.js";
 import { LAYER_WIDTH_BITS, splatRanges, targetsProgram } from "../shaders/mlp.js";
-import { readingGlsl } from "../shaders/reading.js";
+import { TARGETS_READING } from "../shaders/reading.js";
 import type { Vector } from "../vectors.js";
 import { bindInputs } from "./binding.js";
 import { type Device, PAIR_TARGETS } from "./device.js";
@@ -24,7 +24,7 @@ interface Pass {
 }
 
 export class TargetsPass implements MlpPass {
-  readonly reading: string;
+  readonly reading = TARGETS_READING;
   readonly passTexels = 0;
   private readonly passes: Pass[];
   private readonly layers: number;
@@ -38,7 +38,6 @@ export class TargetsPass implements MlpPass {
     most: number,
   ) {
     const splats = shape.offsetsPerAnchor;
-    this.reading = readingGlsl("mrt", splats, most);
     this.layers = PAIR_TARGETS * Math.ceil(splats / 2);
     const layout = mlpLayout(shape);
     this.passes = splatRanges(splats, most).map((range) => ({
@@ -80,7 +79,7 @@ export class TargetsPass implements MlpPass {
           `${this.layers} layers, at most ${maxTextureSize} of ${maxLayers} fit; set maxSplats.`,
       );
     }
-    if (this.texture) this.resources.deleteTexture(this.texture);
+    if (this.texture) this.resources.delete(this.texture);
     this.rows = this.rows ? Math.min(Math.ceil(1.25 * rows), maxTextureSize) : rows;
     this.texture = plainTexture(this.resources, gl.TEXTURE_2D_ARRAY);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA32UI, WIDTH, this.rows, this.layers);

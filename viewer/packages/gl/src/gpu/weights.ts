@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The MLPs' weights in the order in which the shader reads them, four per texel. */
 
-import type { Fields } from "@structgstream/core";
+import type { FieldName, Fields } from "@structgstream/core";
 import type { Shape } from "../scene.js";
 
 /** Numbers of texels, common to shader and weights. */
@@ -24,6 +24,9 @@ const HEADS = [
   ["color", "color_mlp", 3],
   ["covariance", "covariance_mlp", 7],
 ] as const;
+
+/** Fields that contain weights. */
+export const WEIGHT_FIELDS: readonly FieldName[] = [...HEADS.map(([, field]) => field), "appearance_basis"];
 
 export function mlpLayout(shape: Shape): MlpLayout {
   const featureTexels = Math.ceil(shape.features / 4);

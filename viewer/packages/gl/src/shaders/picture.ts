@@ -4,7 +4,7 @@
 import type { ProgramSource } from "../gpu/resources.js";
 import { COVERING_VERTEX } from "./mlp.js";
 
-/** @param rows of the environment: spherical harmonics of degree 0, 1 or 2; 0 without one */
+/** @param rows of the environment: spherical harmonics of degree 0, 1 or 2; 0 without one, then black is behind */
 export function pictureProgram(rows: number): ProgramSource {
   const [y0, a, b] = [0.5 / Math.sqrt(Math.PI), Math.sqrt(3 / (4 * Math.PI)), Math.sqrt(15 / (4 * Math.PI))];
   const c = Math.sqrt(5 / (16 * Math.PI));
@@ -30,7 +30,7 @@ ${basis.map((term, i) => `  sum += (${term}) * environment[${i}];`).join("\n")}
   return clamp(sum, 0.0, 1.0);
 }
 `
-    : "uniform vec3 background;\nvec3 behind(vec2 pixel) { return background; }\n";
+    : "vec3 behind(vec2 pixel) { return vec3(0.0); }\n";
   return {
     vertex: COVERING_VERTEX,
     fragment: `

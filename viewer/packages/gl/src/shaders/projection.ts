@@ -18,7 +18,7 @@ const MIN_LOW_PASS = 0.15;
  * One fragment is one slot. First target: mean x, y, covariance xx, xy; second: covariance yy, opacity, colour in halves.
  * A slot with an opacity of 0 is not drawn.
  *
- * @param reading of `readingGlsl`
+ * @param reading of an `MlpPass`
  */
 export function projectionProgram(splats: number, reading: string): ProgramSource {
   return {

@@ -2,15 +2,10 @@
 /** GLSL that reads the outputs of the MLP passes of either path: `readGaussian(v, k, a, b, c)`. */
 
 import { PAIR_TARGETS, SPLAT_VECTORS } from "../gpu/device.js";
-import type { MlpPath } from "../types.js";
 import { LAYER_WIDTH_BITS } from "./mlp.js";
 
 /** @param most Gaussians of an anchor that one pass computes */
-export function readingGlsl(path: MlpPath, splats: number, most: number): string {
-  return path === "mrt" ? targetsReading(most) : feedbackReading(splats, most);
-}
-
-function feedbackReading(splats: number, most: number): string {
+export function feedbackReading(splats: number, most: number): string {
   return `
 uniform sampler2D outputs;
 uniform int passTexels;
@@ -25,9 +20,7 @@ void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
 }
 
 /** All passes except the last have an even number of Gaussians, so the layers of a pair do not depend on the passes. */
-function targetsReading(most: number): string {
-  if (most % 2) throw new RangeError(`passes of ${most} Gaussians would part a pair`);
-  return `
+export const TARGETS_READING = `
 uniform usampler2DArray outputs;
 void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
   ivec2 at = ivec2(v & ${(1 << LAYER_WIDTH_BITS) - 1}, v >> ${LAYER_WIDTH_BITS});
@@ -43,4 +36,3 @@ void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
   c = vec4(unpackHalf2x16(tail.x), unpackHalf2x16(tail.y));
 }
 `;
-}

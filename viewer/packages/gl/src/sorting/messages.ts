@@ -3,15 +3,14 @@
 
 import type { IntervalBound } from "../sampling.js";
 import type { Camera } from "../types.js";
-import type { PlacingField } from "./placement.js";
+import type { PlacingArrays } from "./placement.js";
 
 /** A request for an order. */
 export interface OrderRequest {
   readonly id: number;
   /** Changes of the scene since the last request, in buffers that are transferred. */
-  readonly changed: ReadonlyMap<PlacingField, Float32Array<ArrayBuffer>>;
+  readonly changed: PlacingArrays;
   readonly offsetsPerAnchor: number;
-  readonly freeColumns: number;
   readonly interval: IntervalBound;
   readonly camera: Camera;
   readonly maxSplats: number;

@@ -111,7 +111,6 @@ export class Orders {
       id: ++this.id,
       changed,
       offsetsPerAnchor: sizesOf(fields).offsetsPerAnchor,
-      freeColumns: fields.get("free")!.shape[1]!,
       interval: next.snapshot.training.bound,
       camera: next.camera,
       maxSplats: next.maxSplats,

@@ -8,14 +8,11 @@ import { type IntervalBound, TRAINING_LOW_PASS } from "../sampling.js";
 export const PLACING_FIELDS = ["anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "free"] as const;
 export type PlacingField = (typeof PLACING_FIELDS)[number] & FieldName;
 
-/** Their numbers, and sizes from their shapes. */
-export interface PlacingState {
-  readonly arrays: ReadonlyMap<PlacingField, Float32Array>;
-  readonly offsetsPerAnchor: number;
-  readonly freeColumns: number;
-  readonly interval: IntervalBound;
-}
+/** Their numbers. */
+export type PlacingArrays = ReadonlyMap<PlacingField, Float32Array<ArrayBuffer>>;
 
+/** Of a free Gaussian. */
+const FREE_COLUMNS = 14;
 /** Radius of a Gaussian, in standard deviations: alpha = 1/255 is reached before 3.33 at any opacity. */
 const BALL_DEVIATIONS = 3.4;
 
@@ -33,28 +30,26 @@ export class Placement {
   /** [M] the largest standard deviation that a Gaussian of the anchor can have, without low-pass. */
   extents = new Float32Array(0);
 
-  set(state: PlacingState): void {
-    const positions = array(state, "anchor_positions");
-    const offsetScales = array(state, "offset_scales");
-    const baseScales = array(state, "base_scales");
-    const offsets = array(state, "anchor_offsets");
-    const free = array(state, "free");
-    const k = state.offsetsPerAnchor;
+  set(arrays: PlacingArrays, k: number, interval: IntervalBound): void {
+    const [positions, offsetScales, baseScales, offsets, free] = PLACING_FIELDS.map((name) => arrays.get(name)!) as [
+      Float32Array<ArrayBuffer>,
+      ...Float32Array[],
+    ];
     this.positions = positions;
     this.offsetsPerAnchor = k;
     this.anchors = positions.length / 3;
-    this.free = free.length / state.freeColumns;
+    this.free = free!.length / FREE_COLUMNS;
     const splats = this.anchors * k + this.free;
     if (this.centers.length !== 3 * splats) this.centers = new Float32Array(3 * splats);
     if (this.radii.length !== this.anchors) {
       this.radii = new Float32Array(this.anchors);
       this.extents = new Float32Array(this.anchors);
     }
-    this.placeAnchors(offsets, offsetScales, baseScales, state.interval);
-    for (let i = 0, to = 3 * this.anchors * k, from = 0; i < this.free; i++, to += 3, from += state.freeColumns) {
-      this.centers[to] = free[from]!;
-      this.centers[to + 1] = free[from + 1]!;
-      this.centers[to + 2] = free[from + 2]!;
+    this.placeAnchors(offsets!, offsetScales!, baseScales!, interval);
+    for (let i = 0, to = 3 * this.anchors * k, from = 0; i < this.free; i++, to += 3, from += FREE_COLUMNS) {
+      this.centers[to] = free![from]!;
+      this.centers[to + 1] = free![from + 1]!;
+      this.centers[to + 2] = free![from + 2]!;
     }
   }
 
@@ -83,11 +78,4 @@ export class Placement {
       radii[m] = Math.sqrt(reach) + BALL_DEVIATIONS * drawn;
     }
   }
-}
-
-function array(state: PlacingState, name: PlacingField): Float32Array<ArrayBuffer> {
-  const found = state.arrays.get(name);
-  // Only this package creates the state, so this is an internal error.
-  if (!found) throw new TypeError(`the sorter was given a state without ${name}`);
-  return found as Float32Array<ArrayBuffer>;
 }

@@ -18,7 +18,7 @@ export class Sorter {
   order(request: OrderRequest): Order {
     const began = performance.now();
     const { placement, arrays } = this;
-    const { offsetsPerAnchor, freeColumns, interval, camera } = request;
+    const { offsetsPerAnchor, interval, camera } = request;
     const returned: ArrayBuffer[] = [];
     if (request.changed.size) {
       for (const [name, array] of request.changed) {
@@ -26,7 +26,7 @@ export class Sorter {
         if (before) returned.push(before.buffer);
         arrays.set(name, array);
       }
-      placement.set({ arrays, offsetsPerAnchor, freeColumns, interval });
+      placement.set(arrays, offsetsPerAnchor, interval);
     }
     const [first, second] = request.buffers;
     const anchors = fitting(first, placement.anchors);

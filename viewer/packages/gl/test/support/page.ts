@@ -7,14 +7,12 @@ import {
   type RendererOptions,
   type RenderOptions,
   type RenderStats,
-  rigCamera,
   SplatRenderer,
 } from "../../src/index.js";
 import { HeldWorker } from "./heldWorker.js";
 import { mlpOutputs } from "./mlpOutputs.js";
 import { base64, pixelsOf } from "./pixels.js";
 import { type ReadBack, readBack } from "./readBack.js";
-import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
 export type PlainCamera = Omit<Camera, "viewmat"> & { readonly viewmat: readonly number[] };
@@ -41,7 +39,7 @@ export class Play {
   readonly canvas = document.createElement("canvas");
   readonly renderer: SplatRenderer;
   readonly sorter: HeldWorker;
-  readonly events: string[] = [];
+  readonly errors: string[] = [];
   private given = new Map<string, unknown>();
 
   constructor(
@@ -54,9 +52,7 @@ export class Play {
     // Without one, the renderer starts the file next to its own.
     const sorter = options.ownSorter ? {} : { sorter: this.sorter as unknown as Worker };
     this.renderer = new SplatRenderer(this.canvas, { ...options, ...sorter });
-    this.renderer.onContextLost = () => this.events.push("lost");
-    this.renderer.onContextRestored = () => this.events.push("restored");
-    this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
+    this.renderer.onError = (error) => this.errors.push(error.message);
     this.renderer.load(reader.header!);
   }
 
@@ -72,10 +68,6 @@ export class Play {
         }),
     );
     this.renderer.update({ index, ptsSeconds, fields: changed });
-  }
-
-  rig(name: string): Camera {
-    return rigCamera(this.reader.header!, name);
   }
 
   async picture(plain: PlainCamera, options?: RenderOptions): Promise<{ stats: RenderStats; rgba: string }> {
@@ -122,38 +114,6 @@ async function open(url: string, options: PlainOptions = {}): Promise<Play> {
   return play;
 }
 
-/** Milliseconds on this thread of each of `repeats` frames in a row, from update to settled picture. */
-async function played(play: Play, camera: Camera, repeats: number): Promise<{ calls: number[]; shown: number }> {
-  const frames = play.reader.packets.length;
-  const updates = Array.from({ length: Math.min(frames, 8) }, (_, index) => play.reader.frame(index));
-  const calls: number[] = [];
-  const seen = new Set<number | undefined>();
-  for (let i = 0; i < repeats; i++) {
-    const frame = updates[i % updates.length]!;
-    const fields = new Map(
-      [...frame.fields]
-        .filter(([name]) => play.reader.header!.dynamic.has(name))
-        .map(([name, { shape, data }]) => [name, { shape, data: data.slice() }] as const),
-    );
-    const viewmat = camera.viewmat.map((value, at) => (at === 3 ? value + 0.001 * i : value));
-    let began = performance.now();
-    play.renderer.update({ index: i, ptsSeconds: i, fields });
-    let spent = performance.now() - began;
-    for (;;) {
-      began = performance.now();
-      const stats = play.renderer.render({ ...camera, viewmat });
-      spent += performance.now() - began;
-      if (stats.drawn && stats.frameIndex !== undefined) seen.add(stats.frameIndex);
-      if (stats.settled) break;
-      await new Promise<void>((resolve) => {
-        play.renderer.onOrder = resolve;
-      });
-    }
-    calls.push(spent);
-  }
-  return { calls, shown: seen.size };
-}
-
 function lessen(canvas: HTMLCanvasElement, device: Lesser): void {
   const open = canvas.getContext.bind(canvas) as (kind: string, attributes?: unknown) => WebGL2RenderingContext | null;
   const lesser = (kind: string, attributes?: unknown) => {
@@ -177,7 +137,7 @@ async function pngPixels(url: string): Promise<string> {
 }
 
 /** `plays` are all that were opened. */
-const api = { open, cameraOf, pngPixels, timed, played, plays: [] as Play[] };
+const api = { open, cameraOf, pngPixels, plays: [] as Play[] };
 declare global {
   var stage: typeof api;
 }

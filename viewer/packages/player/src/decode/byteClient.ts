@@ -2,22 +2,13 @@
 /** The decode worker's interface to the fetch worker. */
 
 import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "../source/description.js";
-import type { Manifest, PageContent, PageEntry, Quality } from "../source/manifest.js";
+import type { PageEntry } from "../source/manifest.js";
 import type { Port } from "../source/port.js";
 
-/** Events of one reading; none follows `end` or `failed`. */
-export interface ReadingEvents {
-  begin?(reply: ReadReply & { type: "begin" }): void;
-  bytes?(bytes: Uint8Array): void;
-  manifest?(manifest: Manifest): void;
-  qualities?(qualities: readonly Quality[]): void;
-  page?(content: PageContent): void;
-  end(): void;
-  /** A `temporary` failure may disappear without action. */
-  failed(message: string, temporary: boolean): void;
-  waiting?(seconds: number, problem: string | undefined): void;
-  recovered?(): void;
-}
+type AnyReply = { readonly [Type in ReadReply["type"]]: (reply: ReadReply & { readonly type: Type }) => void };
+
+/** What is done with the replies of one reading; none follows `end` or `failed`. */
+export type ReadingEvents = Partial<AnyReply> & Pick<AnyReply, "end" | "failed">;
 
 export class ByteClient {
   private readonly readings = new Map<number, ReadingEvents>();
@@ -66,17 +57,7 @@ export class ByteClient {
     if (reply.type === "bytes") this.fetchedBytes += reply.bytes.length;
     const events = this.readings.get(reply.id);
     if (!events) return;
-    if (reply.type === "begin") events.begin?.(reply);
-    else if (reply.type === "bytes") events.bytes?.(reply.bytes);
-    else if (reply.type === "manifest") events.manifest?.(reply.manifest);
-    else if (reply.type === "qualities") events.qualities?.(reply.qualities);
-    else if (reply.type === "page") events.page?.(reply.content);
-    else if (reply.type === "recovered") events.recovered?.();
-    else if (reply.type === "waiting") events.waiting?.(reply.seconds, reply.problem);
-    else {
-      this.readings.delete(reply.id);
-      if (reply.type === "end") events.end();
-      else events.failed(reply.message, reply.temporary);
-    }
+    if (reply.type === "end" || reply.type === "failed") this.readings.delete(reply.id);
+    (events[reply.type] as ((reply: ReadReply) => void) | undefined)?.(reply);
   }
 }

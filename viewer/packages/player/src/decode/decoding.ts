@@ -15,6 +15,7 @@ import { SegmentedStreams } from "./segmentedStreams.js";
 import type { Chapter, Stream, StreamEvents } from "./stream.js";
 import { Throttle } from "./throttle.js";
 
+const BUDGET_BYTES = 64 * 2 ** 20;
 /** Longest interval between pictures on a machine that decodes too slowly. */
 const LATE_PICTURE_MILLISECONDS = 250;
 /** Shortest interval between messages about values that change with every packet. */
@@ -46,10 +47,12 @@ export class Decoding {
   /** The next frame whose sound is sent, for the demand of this serial. */
   private sound: { readonly serial: number; next: number } | undefined;
 
+  /** @param budgetBytes largest number of bytes of stored packets */
   constructor(
     private readonly port: Port<FromDecoder, ToDecoder>,
     bytes: Port<ReadRequest, ReadReply>,
     private readonly breathe: () => Promise<void>,
+    private readonly budgetBytes = BUDGET_BYTES,
   ) {
     this.client = new ByteClient(bytes);
     port.onmessage = ({ data }) => this.obey(data);
@@ -61,12 +64,11 @@ export class Decoding {
     else if (message.type === "demand") {
       this.demand = message.demand;
       this.sendSound();
-    } else if (message.type === "quality") this.segmented?.choose(message.quality);
-    else this.announced?.changed.forget();
+    } else this.segmented?.choose(message.quality);
     this.wake?.();
   }
 
-  private open({ source, fromStart, budgetBytes }: ToDecoder & { type: "open" }): void {
+  private open({ source, fromStart }: ToDecoder & { type: "open" }): void {
     this.client.open(source);
     const common: StreamEvents = {
       changed: () => this.catalogChanged(),
@@ -76,7 +78,7 @@ export class Decoding {
       failed: (message, fatal) => this.post({ type: "failed", message, fatal }),
     };
     if (source.kind === "segments") {
-      this.segmented = new SegmentedStreams(this.client, source.url, source.name, budgetBytes, {
+      this.segmented = new SegmentedStreams(this.client, source.url, source.name, this.budgetBytes, {
         ...common,
         begun: (stream) => this.begin(stream),
         notice: (message) => this.post({ type: "notice", message }),
@@ -84,7 +86,7 @@ export class Decoding {
       });
       return;
     }
-    FileStream.open(this.client, source.name, fromStart, budgetBytes, {
+    FileStream.open(this.client, source.name, fromStart, this.budgetBytes, {
       ...common,
       opening: (loadedBytes, totalBytes, ended) => this.post({ type: "opening", loadedBytes, totalBytes, ended }),
       begun: (stream, header, ranged) => {
@@ -168,7 +170,7 @@ export class Decoding {
       this.decoded = index;
     } catch (error) {
       if (!(error instanceof StreamError)) throw error;
-      this.lose(index, undefined, error.message.replace(/\.$/, ""));
+      this.lose(index, undefined, error.message);
       return;
     }
     this.milliseconds += performance.now() - start;
@@ -217,7 +219,7 @@ export class Decoding {
     catalog.markDamaged(first, end);
     const last = (end ?? catalog.groupEnd(first)) - 1;
     const frames = last === first ? `Frame ${first} is` : `Frames ${first} to ${last} are`;
-    this.post({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, last + 1] });
+    this.post({ type: "damage", message: `${frames} lost: ${reason.replace(/\.$/, "")}.`, lost: [first, last + 1] });
     this.catalogPosts.call();
     this.wake?.();
   }

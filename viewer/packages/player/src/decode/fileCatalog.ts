@@ -70,9 +70,9 @@ export class FileCatalog extends Catalog {
     return this.inits[period]?.first ?? this.count;
   }
 
-  /** Adds a packet that was found during reading; frames that it skips are lost. */
+  /** Adds a packet that was found during reading; the caller reports frames that it skips as lost. */
   append({ index, isKey, offset, bytes, ptsSeconds }: PacketInfo): void {
-    while (this.entries.length < index) this.markDamaged(this.entries.push(undefined) - 1);
+    while (this.entries.length < index) this.entries.push(undefined);
     this.entries.push({ isKey, offset, end: offset + bytes, ptsSeconds });
   }
 

@@ -16,13 +16,12 @@ import {
 import type { ByteClient } from "./byteClient.js";
 import type { Place } from "./catalog.js";
 import { FileCatalog } from "./fileCatalog.js";
-import { Opening } from "./opening.js";
+import { Opening, type OpeningEvents } from "./opening.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
 import { type Chapter, Chapters, type Stream, type StreamEvents } from "./stream.js";
 
-export interface FileEvents extends StreamEvents {
-  opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
+export interface FileEvents extends StreamEvents, Pick<OpeningEvents, "opening"> {
   /** The header is available. */
   begun(stream: FileStream, header: StreamHeader, ranged: boolean): void;
   /** The first packet that is needed at present. */
@@ -66,7 +65,7 @@ export class FileStream implements Stream {
     const opening = new Opening(
       client,
       {
-        opening: (loadedBytes, totalBytes, ended) => events.opening(loadedBytes, totalBytes, ended),
+        ...events,
         header: (header, ranged, index) => {
           stream = new FileStream(client, header, index !== undefined, budgetBytes, events);
           if (index) stream.catalog.fill(index.entries, index.end);
@@ -74,8 +73,6 @@ export class FileStream implements Stream {
           if (index) events.changed();
         },
         read: (reader, ended) => stream?.take(reader, ended),
-        waiting: (seconds, problem) => events.waiting(seconds, problem),
-        failed: (problem) => events.failed(problem, true),
       },
       name,
       fromStart,
@@ -105,22 +102,22 @@ export class FileStream implements Stream {
     const { first, start, end } = catalog.init(period);
     const queue = new ByteQueue();
     this.client.read(start, end, false, {
-      bytes: (bytes) => queue.append(bytes),
+      bytes: ({ bytes }) => queue.append(bytes),
       end: () => {
         try {
           this.chapters.put(period, this.headerIn(queue, start));
         } catch (error) {
           if (!(error instanceof StreamError)) throw error;
-          events.lost(first, catalog.periodEnd(period), error.message.replace(/\.$/, ""));
+          events.lost(first, catalog.periodEnd(period), error.message);
         }
         coming.delete(period);
         events.stored();
       },
-      failed: (problem) => {
+      failed: ({ message }) => {
         coming.delete(period);
-        events.failed(problem, false);
+        events.failed(message, false);
       },
-      waiting: (seconds, problem) => events.waiting(seconds, problem),
+      waiting: ({ seconds, problem }) => events.waiting(seconds, problem),
     });
   }
 

@@ -28,14 +28,10 @@ export type ToDecoder =
       readonly source: SourceDescription;
       /** Whether playback starts at the first frame, so that its packet is fetched with the header. */
       readonly fromStart: boolean;
-      /** Largest number of bytes of stored packets. */
-      readonly budgetBytes: number;
     }
   | { readonly type: "demand"; readonly demand: Demand }
   /** One of the renditions; undefined for automatic selection. */
-  | { readonly type: "quality"; readonly quality: number | undefined }
-  /** The next frame must have all its dynamic fields. */
-  | { readonly type: "refresh" };
+  | { readonly type: "quality"; readonly quality: number | undefined };
 
 /** Bytes and time of one packet. */
 export interface PacketFacts {

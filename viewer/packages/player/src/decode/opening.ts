@@ -19,22 +19,21 @@ import {
 } from "@structgstream/core";
 import { joined } from "../source/joined.js";
 import type { ByteClient, ReadingEvents } from "./byteClient.js";
+import type { StreamEvents } from "./stream.js";
 
 const HEAD_BYTES = 4096;
 const TAIL_BYTES = 4096;
 /** Largest number of entries of an index: 3 hours at 100 frames per second. */
 const MAX_INDEX_BYTES = 2 ** 24;
 
-/** Events of opening, in this order: progress, the header, the index if there is one, then packets. */
-export interface OpeningEvents {
+/** Events of opening, in this order: progress, the header, then packets. */
+export interface OpeningEvents extends Pick<StreamEvents, "waiting" | "failed"> {
   /** `ended`: the file ends within its header at present. */
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
   /** `index` is defined if it has the positions of all packets, with the offset after the last one. */
   header(header: StreamHeader, ranged: boolean, index: { entries: IndexEntry[]; end: number } | undefined): void;
   /** The reader has new packets or has found damage; no event follows `ended`. */
   read(reader: StreamReader, ended: boolean): void;
-  waiting(seconds: number, problem: string | undefined): void;
-  failed(message: string): void;
 }
 
 export class Opening {
@@ -48,8 +47,8 @@ export class Opening {
   private announced = false;
   private reading: number | undefined;
   private readonly troubles: Pick<ReadingEvents, "failed" | "waiting"> = {
-    failed: (message) => this.events.failed(message),
-    waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+    failed: ({ message }) => this.events.failed(message, true),
+    waiting: ({ seconds, problem }) => this.events.waiting(seconds, problem),
   };
 
   constructor(
@@ -76,7 +75,7 @@ export class Opening {
         this.ranged &&= ranged || !wholeIfNeeded;
         this.lookedForIndex ||= !this.ranged;
       },
-      bytes: (bytes) => this.take(bytes),
+      bytes: ({ bytes }) => this.take(bytes),
       end: then,
       ...this.troubles,
     });
@@ -85,7 +84,7 @@ export class Opening {
   private readTail(start: number, fileBytes: number): void {
     const parts: Uint8Array[] = [];
     this.client.read(start, fileBytes, false, {
-      bytes: (bytes) => parts.push(bytes),
+      bytes: ({ bytes }) => parts.push(bytes),
       end: () => this.lookAtTail(joined(parts), start, fileBytes),
       ...this.troubles,
     });
@@ -119,7 +118,7 @@ export class Opening {
       else this.read(this.loaded, end, false, () => this.headerByIndex(end));
     };
     this.client.read(last.offset, last.offset + TIMED_BYTES, false, {
-      bytes: (bytes) => parts.push(bytes),
+      bytes: ({ bytes }) => parts.push(bytes),
       end: useTime,
       ...this.troubles,
     });
@@ -140,10 +139,10 @@ export class Opening {
       begin: ({ fileBytes }) => {
         this.fileBytes = fileBytes ?? this.fileBytes;
       },
-      bytes: (bytes) => this.take(bytes),
+      bytes: ({ bytes }) => this.take(bytes),
       end: () => this.finish(),
       ...this.troubles,
-      waiting: (seconds, problem) => {
+      waiting: ({ seconds, problem }) => {
         if (!this.announced && problem === undefined) this.events.opening(this.loaded, undefined, true);
         this.events.waiting(seconds, problem);
       },
@@ -195,7 +194,7 @@ export class Opening {
       action();
     } catch (error) {
       this.stop();
-      this.events.failed(error instanceof Error ? error.message : String(error));
+      this.events.failed(error instanceof Error ? error.message : String(error), true);
     }
   }
 

@@ -12,7 +12,7 @@ import {
   recordIn,
   soundOf,
 } from "@structgstream/core";
-import type { ByteClient } from "./byteClient.js";
+import type { ByteClient, ReadingEvents } from "./byteClient.js";
 import type { Catalog, Place } from "./catalog.js";
 import type { PacketStore } from "./packetStore.js";
 import { Throughput } from "./throughput.js";
@@ -147,8 +147,8 @@ export class PacketLoader {
     };
     this.throughput.begin();
     this.runs.push(run);
-    const events = {
-      bytes: (bytes: Uint8Array) => {
+    const events: ReadingEvents = {
+      bytes: ({ bytes }) => {
         this.throughput.take(bytes.length);
         queue.append(bytes);
         offset = this.packetsIn(queue, offset, run, places, false);
@@ -158,11 +158,11 @@ export class PacketLoader {
         this.packetsIn(queue, offset, run, places, true);
         this.events.changed();
       },
-      failed: (message: string, temporary: boolean) => {
+      failed: ({ message, temporary }) => {
         over();
         this.events.failed(message, temporary, run.next, end, entry?.file ?? "");
       },
-      waiting: (seconds: number, problem: string | undefined) => this.events.waiting(seconds, problem),
+      waiting: ({ seconds, problem }) => this.events.waiting(seconds, problem),
     };
     const of = entry && {
       url: this.url,
@@ -197,10 +197,7 @@ export class PacketLoader {
         queue.skip(all);
         at += all;
         this.events.changed();
-      } else {
-        this.catalog.markDamaged(run.next);
-        this.events.damaged(run.next, place);
-      }
+      } else this.events.damaged(run.next, place);
     }
     return at;
   }

@@ -24,16 +24,14 @@ export class PacketStore {
   }
 
   /**
-   * Stores a packet. If there is no room, others are removed: first those before frame `first`, then the farthest after it.
-   *
-   * @returns whether it was stored; a packet that is farther than all others is not
+   * Stores a packet. If there is no room, packets are removed, perhaps this one: first those before frame `first`, then the
+   * farthest after it.
    */
-  put(packet: Packet, first: number): boolean {
-    if (this.packets.has(packet.index)) return true;
+  put(packet: Packet, first: number): void {
+    if (this.packets.has(packet.index)) return;
     this.packets.set(packet.index, packet);
     this.bytes += packet.payload.length;
     if (this.bytes > this.budgetBytes) this.makeRoom(first);
-    return this.packets.has(packet.index);
   }
 
   /** Stores the sound of a frame whose packet is there; it is removed with that. */

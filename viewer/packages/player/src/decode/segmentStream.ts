@@ -3,7 +3,7 @@
 
 import { StreamReader } from "@structgstream/core";
 import type { Manifest, PageEntry, Quality } from "../source/manifest.js";
-import type { ByteClient } from "./byteClient.js";
+import type { ByteClient, ReadingEvents } from "./byteClient.js";
 import type { Place } from "./catalog.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
@@ -65,11 +65,11 @@ export class SegmentStream implements Stream {
   /** Starts following the manifest. */
   follow(): void {
     this.following ??= this.client.manifests(this.url, this.name, {
-      manifest: (manifest) => this.take(manifest),
-      qualities: (qualities) => this.events.qualities(qualities),
+      manifest: ({ manifest }) => this.take(manifest),
+      qualities: ({ qualities }) => this.events.qualities(qualities),
       end: () => {},
-      failed: (message, temporary) => this.events.failed(message, temporary),
-      waiting: (seconds, problem) => {
+      failed: ({ message, temporary }) => this.events.failed(message, temporary),
+      waiting: ({ seconds, problem }) => {
         // Report it only once.
         if (!this.troubled) this.events.waiting(seconds, problem);
         this.troubled = true;
@@ -127,7 +127,7 @@ export class SegmentStream implements Stream {
     this.fetch(entry.file, (events) => {
       this.client.page(this.url, entry, {
         ...events,
-        page: (content) => {
+        page: ({ content }) => {
           this.catalog.takePage(entry, content);
           this.events.changed();
         },
@@ -140,9 +140,9 @@ export class SegmentStream implements Stream {
     if (!entry) return;
     this.fetch(entry.file, (events) => {
       const reader = new StreamReader(entry.file);
-      const bytes = (part: Uint8Array) => {
+      const bytes: ReadingEvents["bytes"] = (reply) => {
         try {
-          reader.push(part);
+          reader.push(reply.bytes);
           if (!reader.header) reader.finish();
           this.chapters.put(period, reader.header!);
         } catch (error) {
@@ -154,10 +154,7 @@ export class SegmentStream implements Stream {
   }
 
   /** Requests a file once, and again some time after a failure. */
-  private fetch(
-    file: string,
-    ask: (events: { end(): void; failed(message: string, temporary: boolean): void }) => void,
-  ): void {
+  private fetch(file: string, ask: (events: ReadingEvents) => void): void {
     if (this.coming.has(file)) return;
     this.coming.add(file);
     const over = () => {
@@ -166,7 +163,7 @@ export class SegmentStream implements Stream {
     };
     ask({
       end: over,
-      failed: (message, temporary) => {
+      failed: ({ message, temporary }) => {
         if (this.attempt(file, temporary) > ATTEMPTS) this.events.failed(message);
         else setTimeout(over, AGAIN_MILLISECONDS);
       },
@@ -177,7 +174,7 @@ export class SegmentStream implements Stream {
     // Parts are removed when they become a segment; the next manifest has the positions of their frames.
     const same = this.catalog.place(first)?.entry?.file === file;
     if (first < end && same && this.attempt(file, temporary) >= ATTEMPTS) {
-      this.events.lost(first, end, problem.replace(/\.$/, ""));
+      this.events.lost(first, end, problem);
       return;
     }
     if (first === end) this.events.notice(problem);

@@ -155,7 +155,7 @@ export class SegmentedStreams {
     if (now - this.listed < LIST_MILLISECONDS) return;
     this.listed = now;
     const id = this.client.manifests(this.url, this.name, {
-      qualities: (qualities) => this.abr!.measured(qualities),
+      qualities: ({ qualities }) => this.abr!.measured(qualities),
       manifest: () => this.client.cancel(id), // The address has another content by now.
       end: () => {},
       failed: () => {}, // The played stream reports outages.

@@ -4,6 +4,7 @@
 import type { Demand } from "../decode/messages.js";
 import type { Timeline } from "./timeline.js";
 
+/** Time for which packets are fetched in advance. */
 const AHEAD_SECONDS = 10;
 /** Decoded frames in the queue: few are sufficient to even out decoding, and each needs memory. */
 const LEAD_SECONDS = 0.15;
@@ -14,19 +15,12 @@ const MAX_LEAD = 8;
  * The demand of a stream whose clock is at frame `at`.
  *
  * @param rate rate of the clock; undefined while paused
- * @param aheadSeconds time for which packets are fetched in advance
  */
-export function demandOf(
-  timeline: Timeline,
-  serial: number,
-  at: number,
-  rate: number | undefined,
-  aheadSeconds = AHEAD_SECONDS,
-): Demand {
+export function demandOf(timeline: Timeline, serial: number, at: number, rate: number | undefined): Demand {
   if (rate === undefined) return { serial, at, until: at + 1, ahead: at + 1 };
   const { count, first, duration, start } = timeline;
   const lead = Math.ceil((LEAD_SECONDS * rate * (count - first)) / Math.max(duration - start, 1e-3));
   const until = at + 1 + Math.min(Math.max(lead, MIN_LEAD), MAX_LEAD);
-  const ahead = Math.max(timeline.frameAt(timeline.ptsOf(at) + aheadSeconds * rate) + 1, until);
+  const ahead = Math.max(timeline.frameAt(timeline.ptsOf(at) + AHEAD_SECONDS * rate) + 1, until);
   return { serial, at, until, ahead };
 }

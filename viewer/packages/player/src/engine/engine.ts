@@ -3,7 +3,7 @@
 
 import type { StreamHeader } from "@structgstream/core";
 import type { Demand, FromDecoder } from "../decode/messages.js";
-import { SOUND_AHEAD_SECONDS } from "../sound/sound.js";
+import { SOUND_AHEAD_SECONDS, type Sound } from "../sound/sound.js";
 import type { SourceDescription } from "../source/description.js";
 import { demandOf } from "./ahead.js";
 import { MediaClock } from "./clock.js";
@@ -11,7 +11,6 @@ import { Edge } from "./edge.js";
 import { Emitter } from "./emitter.js";
 import type { EngineEvents } from "./events.js";
 import { type DueUpdate, FrameQueue } from "./frameQueue.js";
-import type { EngineOptions } from "./options.js";
 import { PacketLog } from "./packetLog.js";
 import type { Pipeline } from "./pipeline.js";
 import { Progress } from "./progress.js";
@@ -19,7 +18,6 @@ import { Rebuffering } from "./rebuffering.js";
 import { StoredFrames } from "./storedFrames.js";
 import { Timeline } from "./timeline.js";
 
-const BUDGET_BYTES = 64 * 2 ** 20;
 const RATES: readonly [number, number] = [0.05, 16];
 
 export class Engine extends Emitter<EngineEvents> {
@@ -31,7 +29,7 @@ export class Engine extends Emitter<EngineEvents> {
   /** The end of the stream while it grows. */
   readonly edge = new Edge(this.frames);
   readonly packets = new PacketLog();
-  /** Names of the renditions, and the one in use; undefined if there is only one. */
+  /** Names of the renditions, none if there is only one, and the one in use. */
   qualities: { readonly names: readonly string[]; readonly at: number } = { names: [], at: 0 };
   /** The chosen rendition; undefined for automatic selection. */
   quality: number | undefined;
@@ -48,11 +46,14 @@ export class Engine extends Emitter<EngineEvents> {
   private hasEnded = false;
   private failed = false;
 
-  /** @param now seconds of a monotonic clock */
+  /**
+   * @param now seconds of a monotonic clock
+   * @param sound plays the stream's sound; its clock is `now`
+   */
   constructor(
     private readonly pipeline: Pipeline,
     private readonly now: () => number,
-    private readonly options: EngineOptions = {},
+    private readonly sound?: Sound,
   ) {
     super();
     pipeline.onmessage = (message) => this.hear(message);
@@ -65,8 +66,7 @@ export class Engine extends Emitter<EngineEvents> {
   load(source: SourceDescription, startSeconds?: number): void {
     this.startSeconds = startSeconds;
     this.name = source.name;
-    const budgetBytes = this.options.budgetBytes ?? BUDGET_BYTES;
-    this.pipeline.send({ type: "open", source, fromStart: (startSeconds ?? 0) <= 0, budgetBytes });
+    this.pipeline.send({ type: "open", source, fromStart: (startSeconds ?? 0) <= 0 });
   }
 
   play(): void {
@@ -176,12 +176,6 @@ export class Engine extends Emitter<EngineEvents> {
     return this.edge.nextIn(this.now());
   }
 
-  /** Requests all dynamic fields with the next picture, for a renderer that has lost its state. */
-  refresh(): void {
-    this.pipeline.send({ type: "refresh" });
-    if (this.frames.count) this.begin(this.frameIndex, this.clock.at(this.now()));
-  }
-
   /** Must be called before each picture: advances the clock and returns a new update to draw, if there is one. */
   tick(): DueUpdate | undefined {
     if (!this.opened || this.failed) return undefined;
@@ -189,7 +183,7 @@ export class Engine extends Emitter<EngineEvents> {
     if (this.wantsToPlay && !this.seeking) this.advance(now);
     // Sound at another speed than the viewer's pictures would not be right.
     const audible = this.clock.running && this.rate === 1;
-    this.options.sound?.update({ audible, seconds: this.clock.at(now), rate: this.clock.rate, now });
+    this.sound?.update({ audible, seconds: this.clock.at(now), rate: this.clock.rate, now });
     this.ask();
     const update = this.queue.take(this.frames.frameAt(this.clock.at(now)));
     if (!update) return undefined;
@@ -202,7 +196,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.failed = true;
     this.pipeline.onmessage = undefined;
     this.pipeline.close();
-    this.options.sound?.begin(undefined);
+    this.sound?.begin(undefined);
     this.clear();
   }
 
@@ -212,7 +206,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.hasEnded = false;
     this.clock.stop(now);
     this.clock.set(seconds, now);
-    this.options.sound?.flush();
+    this.sound?.flush();
     this.queue.carryAll();
     this.ask();
     this.emit("state", {});
@@ -287,7 +281,7 @@ export class Engine extends Emitter<EngineEvents> {
     const { frames: timeline, clock, frameIndex: at } = this;
     const { serial } = this.progress;
     const rate = this.wantsToPlay ? clock.rate : undefined;
-    const { until, ahead } = demandOf(timeline, serial, at, rate, this.options.aheadSeconds);
+    const { until, ahead } = demandOf(timeline, serial, at, rate);
     const sound = this.soundDemand(at);
     const last = this.demanded;
     const isSame = last?.serial === serial && last.at === at && last.until === until && last.ahead === ahead;
@@ -298,15 +292,14 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** The sound to send for a clock at frame `at`. */
   private soundDemand(at: number): Demand["sound"] {
-    const { frames: timeline, rate } = this;
-    const { sound } = this.options;
+    const { frames: timeline, rate, sound } = this;
     if (!sound?.wanted || !this.wantsToPlay || rate !== 1) return undefined;
     return { serial: sound.serial, until: timeline.frameAt(timeline.ptsOf(at) + SOUND_AHEAD_SECONDS) + 1 };
   }
 
   private hear(message: FromDecoder): void {
     if (message.type === "frame") this.hearFrame(message);
-    else if (message.type === "sound") this.options.sound?.take(message.serial, message.sounds);
+    else if (message.type === "sound") this.sound?.take(message.serial, message.sounds);
     else if (message.type === "gap") this.hearGap(message.serial, message.end);
     else if (message.type === "opening") this.emit("opening", message);
     else if (message.type === "header") this.hearHeader(message.header, message.ranged);
@@ -327,7 +320,7 @@ export class Engine extends Emitter<EngineEvents> {
   private hearHeader(header: StreamHeader, ranged: boolean): void {
     this.header = header;
     this.frames.fps = header.fps;
-    this.options.sound?.begin(header.sound);
+    this.sound?.begin(header.sound);
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
@@ -415,7 +408,7 @@ export class Engine extends Emitter<EngineEvents> {
   private fail(message: string, fatal: boolean): void {
     this.failed ||= fatal;
     this.pause();
-    this.options.sound?.flush();
+    this.sound?.flush();
     this.demanded = undefined; // the next demand tries again
     this.emit("error", { message, fatal });
   }

@@ -25,7 +25,7 @@ export class Progress {
     this.reached = Math.max(this.reached, index);
   }
 
-  /** Whether the target has been reached. */
+  /** Records that the target is reached. */
   arrive(): void {
     this.seeking = false;
     this.reach(this.target);

@@ -2,6 +2,7 @@
 /** Opus packets as an Ogg file, which browsers decode as a whole (RFC 3533, RFC 7845). */
 
 import { PACKET_SAMPLES, SOUND_RATE } from "@structgstream/core";
+import { joined } from "../source/joined.js";
 
 const SERIAL = 1;
 /** A page has at most 255 segments, a packet of 20 ms at most six. */
@@ -26,8 +27,7 @@ function checksum(bytes: Uint8Array): number {
 function page(packets: readonly Uint8Array[], number: number, samples: number, flags: number): Uint8Array {
   const segments: number[] = [];
   for (const { length } of packets) segments.push(...Array(Math.floor(length / 255)).fill(255), length % 255);
-  const size = packets.reduce((sum, { length }) => sum + length, 0);
-  const bytes = new Uint8Array(PAGE_HEAD + segments.length + size);
+  const bytes = joined([new Uint8Array(PAGE_HEAD), Uint8Array.from(segments), ...packets]);
   const view = new DataView(bytes.buffer);
   bytes.set(ascii("OggS"));
   bytes[5] = flags;
@@ -35,18 +35,12 @@ function page(packets: readonly Uint8Array[], number: number, samples: number, f
   view.setUint32(14, SERIAL, true);
   view.setUint32(18, number, true);
   bytes[26] = segments.length;
-  bytes.set(segments, PAGE_HEAD);
-  let at = PAGE_HEAD + segments.length;
-  for (const packet of packets) {
-    bytes.set(packet, at);
-    at += packet.length;
-  }
   view.setUint32(22, checksum(bytes), true);
   return bytes;
 }
 
-function ascii(text: string): number[] {
-  return [...text].map((letter) => letter.charCodeAt(0));
+function ascii(text: string): Uint8Array {
+  return new TextEncoder().encode(text);
 }
 
 /** A file of these packets of 20 ms. It states no samples to skip: who decodes it knows what to leave out. */
@@ -62,11 +56,5 @@ export function oggOf(packets: readonly Uint8Array[], channels: number): Uint8Ar
     const flags = end === packets.length ? ENDS : 0;
     pages.push(page(packets.slice(first, end), pages.length, end * PACKET_SAMPLES, flags));
   }
-  const bytes = new Uint8Array(pages.reduce((sum, { length }) => sum + length, 0));
-  let at = 0;
-  for (const one of pages) {
-    bytes.set(one, at);
-    at += one.length;
-  }
-  return bytes;
+  return joined(pages);
 }

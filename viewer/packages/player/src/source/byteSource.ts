@@ -18,9 +18,9 @@ export interface ByteSink {
 
 export interface ReadOptions {
   /** Offset after the last byte; undefined: the present end of the file. */
-  readonly end?: number;
+  readonly end: number | undefined;
   /** Read the whole file from its first byte if ranges are not supported. */
-  readonly wholeIfNeeded?: boolean;
+  readonly wholeIfNeeded: boolean;
 }
 
 export interface ByteSource {

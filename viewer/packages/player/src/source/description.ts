@@ -54,11 +54,9 @@ export interface StoredPlace {
 
 /** Answers of the fetch worker. */
 export type ReadReply =
-  /** The first byte is that at `start`; without range requests the whole file comes. */
   | {
       readonly type: "begin";
       readonly id: number;
-      readonly start: number;
       readonly fileBytes: number | undefined;
       readonly ranged: boolean;
     }

@@ -154,14 +154,14 @@ export class Fetcher {
     let begun = false;
     for (let attempt = 0; ; ) {
       try {
-        const options = { ...(end === undefined ? {} : { end }), wholeIfNeeded: wholeIfNeeded === true && !begun };
+        const options = { end, wholeIfNeeded: wholeIfNeeded === true && !begun };
         await source.read(
           at,
           options,
           {
-            begin: (opening) => {
-              at = opening.start;
-              if (!begun && !signal.aborted) this.port.postMessage({ type: "begin", id, ...opening }, []);
+            begin: ({ start: from, fileBytes, ranged }) => {
+              at = from;
+              if (!begun && !signal.aborted) this.port.postMessage({ type: "begin", id, fileBytes, ranged }, []);
               begun = true;
               this.answered = true;
             },

@@ -12,11 +12,6 @@ import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from ".
 const STILL_SECONDS = 600;
 const TEMPORARY = new Set([408, 429, 500, 502, 503, 504]);
 
-interface ContentRange {
-  readonly start: number | undefined;
-  readonly fileBytes: number | undefined;
-}
-
 export class HttpSource implements ByteSource {
   private growing = true;
   private fileBytes = 0;
@@ -40,27 +35,32 @@ export class HttpSource implements ByteSource {
     const response = await this.answer(start - before, options.end, signal);
     this.noticeAge(response);
     if (response.status === 416) {
-      this.takeNothing(start, response, sink);
+      const { fileBytes } = rangeOf(response);
+      this.checkSize(fileBytes);
+      sink.begin({ start, fileBytes, ranged: true });
       return;
     }
     if (response.status !== 206 && response.status !== 200) throw refusal(this.name, response.status);
-    const found = response.status === 206 ? rangeOf(response.headers.get("Content-Range")) : undefined;
-    if (found) {
+    const { end = Number.POSITIVE_INFINITY, wholeIfNeeded } = options;
+    if (response.status === 206) {
+      const found = rangeOf(response);
       // A page of another origin may not see the response's range; it is that of the request then.
       const from = start - before;
-      if ((found.start ?? from) !== from) throw this.misplaced(from, found.start);
+      if ((found.start ?? from) !== from) {
+        throw new SourceError(`The server sent ${this.name} from byte ${found.start} instead of byte ${from}.`);
+      }
       this.checkSize(found.fileBytes);
       sink.begin({ start, fileBytes: found.fileBytes, ranged: found.fileBytes !== undefined });
-      return this.pour(response, before, (options.end ?? Number.POSITIVE_INFINITY) - start, sink);
+      return this.pour(response, before, end - start, sink);
     }
     const fileBytes = lengthOf(response);
-    if (options.wholeIfNeeded) {
+    if (wholeIfNeeded) {
       sink.begin({ start: 0, fileBytes, ranged: false });
       return this.pour(response, 0, Number.POSITIVE_INFINITY, sink);
     }
     sink.begin({ start, fileBytes, ranged: false });
     if (fileBytes !== undefined && fileBytes <= start) return response.body?.cancel();
-    return this.pour(response, start, (options.end ?? Number.POSITIVE_INFINITY) - start, sink);
+    return this.pour(response, start, end - start, sink);
   }
 
   private answer(start: number, end: number | undefined, signal: AbortSignal): Promise<Response> {
@@ -88,12 +88,6 @@ export class HttpSource implements ByteSource {
     }
   }
 
-  private takeNothing(start: number, response: Response, sink: ByteSink): void {
-    const { fileBytes } = rangeOf(response.headers.get("Content-Range"));
-    this.checkSize(fileBytes);
-    sink.begin({ start, fileBytes, ranged: true });
-  }
-
   private checkSize(fileBytes: number | undefined): void {
     if (fileBytes === undefined) return;
     if (fileBytes < this.fileBytes) {
@@ -109,10 +103,6 @@ export class HttpSource implements ByteSource {
     const now = Date.parse(response.headers.get("Date") ?? "");
     // The server's clock, if known, because the user's may be wrong.
     if (!Number.isNaN(changed)) this.growing = (Number.isNaN(now) ? Date.now() : now) - changed < STILL_SECONDS * 1000;
-  }
-
-  private misplaced(start: number, found: number | undefined): SourceError {
-    return new SourceError(`The server sent ${this.name} from byte ${found} instead of byte ${start}.`);
   }
 }
 
@@ -151,8 +141,9 @@ export function refusal(name: string, status: number): SourceError {
 }
 
 /** Parses `bytes 0-9/100` or `bytes * /100`; undefined if it is missing or malformed. */
-function rangeOf(header: string | null): ContentRange {
-  const found = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(header?.trim() ?? "");
+function rangeOf(response: Response): { start: number | undefined; fileBytes: number | undefined } {
+  const header = response.headers.get("Content-Range") ?? "";
+  const found = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(header.trim());
   if (!found) return { start: undefined, fileBytes: undefined };
   const [, start, size] = found;
   return {

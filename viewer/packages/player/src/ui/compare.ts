@@ -55,9 +55,9 @@ export class Compare {
     this.folder = new URL("truth/", list);
   }
 
-  /** Whether the camera whose view is shown has a picture. */
+  /** Whether any camera has pictures. */
   get possible(): boolean {
-    return this.folder !== undefined && this.names.size > 0;
+    return this.names.size > 0;
   }
 
   has(name: string | undefined): boolean {

@@ -13,13 +13,3 @@ export function bytesText(bytes: number): string {
   if (bytes < 1e6) return `${(bytes / 1000).toFixed(bytes < 1e5 ? 1 : 0)} kB`;
   return `${(bytes / 1e6).toFixed(1)} MB`;
 }
-
-export function countText(count: number): string {
-  if (!Number.isFinite(count)) return "all";
-  return Math.round(count).toLocaleString("en");
-}
-
-/** `anchor_positions` as words. */
-export function fieldText(name: string): string {
-  return name.replaceAll("_", " ");
-}

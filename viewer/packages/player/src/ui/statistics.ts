@@ -4,7 +4,7 @@
 import type { FieldName } from "@structgstream/core";
 import type { Player } from "../player.js";
 import { made, setText } from "./dom.js";
-import { bytesText, countText, fieldText } from "./format.js";
+import { bytesText } from "./format.js";
 
 const EVERY_SECONDS = 0.2;
 const HEAD_BYTES = 24;
@@ -37,7 +37,7 @@ export class Statistics {
     if (ageSeconds !== undefined) this.set("Filmed", `${ageSeconds.toFixed(1)} s ago`);
     this.set("Bit rate, last second", this.rateText(index));
     this.set("Fetched", bytesText(engine.stored.fetchedBytes));
-    this.set("Splats drawn", stats ? countText(stats.splats) : "–");
+    this.set("Splats drawn", stats ? stats.splats.toLocaleString("en") : "–");
     this.set("Decoding, worker", `${engine.packets.decodeMilliseconds.toFixed(1)} ms`);
     this.set("Sorting, worker", stats ? `${stats.sortMilliseconds.toFixed(1)} ms` : "–");
     this.set("Main thread a picture", stats ? `${stats.callMilliseconds.toFixed(1)} ms` : "–");
@@ -84,7 +84,7 @@ export class Statistics {
     const known = this.fields.get(name);
     if (known) return known;
     const bytes = made("span");
-    const row = made("div", { class: "field" }, made("span", {}, fieldText(name)), bytes, made("i"));
+    const row = made("div", { class: "field" }, made("span", {}, name.replaceAll("_", " ")), bytes, made("i"));
     this.byField.append(row);
     this.fields.set(name, { row, bytes });
     return { row, bytes };

@@ -27,7 +27,7 @@ canvas { display: block; }
 .frustum path { fill: rgb(0 0 0 / 1%); stroke: #fff; stroke-opacity: .75; stroke-width: 1.25; pointer-events: all; cursor: pointer;
   paint-order: stroke; vector-effect: non-scaling-stroke; }
 .frustum.heldout path { stroke-dasharray: 4 3; }
-.frustum:hover path, .frustum.at path { stroke: var(--accent); stroke-opacity: 1; fill: rgb(110 168 255 / 18%); }
+.frustum:hover path { stroke: var(--accent); stroke-opacity: 1; fill: rgb(110 168 255 / 18%); }
 .frustum text { fill: #fff; font-size: 11px; text-anchor: middle; paint-order: stroke; stroke: rgb(0 0 0 / 65%); stroke-width: 3px; }
 .glass { background: var(--panel); border: 1px solid var(--line); border-radius: 10px; backdrop-filter: blur(14px);
   -webkit-backdrop-filter: blur(14px); }

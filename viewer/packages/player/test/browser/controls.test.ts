@@ -6,7 +6,7 @@ import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
 import { TestServer } from "../../../gl/test/support/server.ts";
 import { CLIP } from "../served.ts";
-import { ask, expectSteady, StagedTests, shows } from "./stage.ts";
+import { ask, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
@@ -287,10 +287,18 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     });
     const reach = (count: number) =>
       page.waitForFunction((wanted) => heard.frames.length >= wanted, count, { timeout: 55_000, polling: 200 });
-    await expectSteady(
-      page,
-      () => reach(50),
-      () => reach(150),
-    );
+    const client = await page.context().newCDPSession(page);
+    const taken = async () => {
+      await client.send("HeapProfiler.collectGarbage");
+      const { usedSize } = await client.send("Runtime.getHeapUsage");
+      const counts = await ask(page, (player) => player.resources);
+      return { usedSize, workers: page.workers().length, ...counts };
+    };
+    await reach(50);
+    const first = await taken();
+    await reach(150);
+    const last = await taken();
+    expect({ ...last, usedSize: 0 }).toEqual({ ...first, usedSize: 0 });
+    expect(last.usedSize).toBeLessThan(first.usedSize * 1.1 + 2e5);
   });
 });

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The built player in a real browser: streams, servers and what it says of them. Skipped where there is none. */
 
-import { readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
 import { TestServer } from "../../../gl/test/support/server.ts";
@@ -19,12 +18,6 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
   test("shows the first frame, plays to the end and again", async () => {
     const page = await stage.open();
     await shows(page, 0);
-    expect(stage.server.rangesOf("/clip.sgs")).toEqual([
-      [0, 4096],
-      [CLIP.length - 4096, CLIP.length],
-      [PACKETS[LAST]!.offset, PACKETS[LAST]!.offset + 20],
-      [4096, PACKETS[0]!.offset + PACKETS[0]!.bytes],
-    ]);
     expect(await ask(page, (player) => [player.duration.toFixed(3), player.paused, player.cameras.length])).toEqual([
       "0.400",
       true,
@@ -95,21 +88,6 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     );
   });
 
-  test("seeks back and forth over groups, asking for what is missing only", async () => {
-    const page = await stage.open();
-    await shows(page, 0);
-    stage.server.requests.length = 0;
-    for (const index of [7, 1, 11, 7, 0]) {
-      await ask(page, new Function("player", `player.seek(${PACKETS[index]!.ptsSeconds})`) as never);
-      await shows(page, index);
-    }
-    expect(stage.server.rangesOf("/clip.sgs")).toEqual([
-      [PACKETS[6]!.offset, PACKETS[8]!.offset],
-      [PACKETS[1]!.offset, PACKETS[2]!.offset],
-      [PACKETS[9]!.offset, PACKETS[LAST]!.offset + PACKETS[LAST]!.bytes],
-    ]);
-  });
-
   test("follows a growing file and says when the next frame may come", async () => {
     const cut = (frames: number) => CLIP.subarray(0, PACKETS[frames - 1]!.offset + PACKETS[frames - 1]!.bytes);
     stage.server.put("/clip.sgs", cut(1), { changed: new Date() });
@@ -151,25 +129,6 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     expect(stage.server.rangesOf("/clip.sgs").length).toBe(1);
   });
 
-  test("plays a cut stream up to the cut, and a damaged one around the damage", async () => {
-    stage.server.put("/clip.sgs", CLIP.subarray(0, PACKETS[5]!.offset + 9));
-    const page = await stage.open('src="clip.sgs" autoplay');
-    await ended(page);
-    await shows(page, 4);
-    const flipped = CLIP.slice();
-    flipped[PACKETS[4]!.offset + 40]! ^= 16;
-    stage.server.put("/flipped.sgs", flipped);
-    await ask(page, (player) => {
-      heard.reported.length = 0;
-      player.setAttribute("src", "flipped.sgs");
-    });
-    await ended(page);
-    await shows(page, LAST);
-    expect(await reported(page)).toEqual([
-      `Frames 4 to 5 are lost: its record at byte ${PACKETS[4]!.offset} is damaged.`,
-    ]);
-  });
-
   // The server is what is slow: Chromium refuses to throttle what workers fetch ("Not supported").
   test("waits on a slow network, and goes on", async () => {
     const file = stage.server.put("/clip.sgs", CLIP, { held: [PACKETS[0]!.offset - 2_500, CLIP.length] });
@@ -202,54 +161,6 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
         }),
     );
     expect(heard).toEqual(["error", false, true, { message: expect.stringMatching(/\.$/), fatal: true }]);
-  });
-
-  test("damaged streams come to an end: a picture or a sentence", async () => {
-    const page = await stage.open("isolated");
-    const vector = readFileSync(new URL("../../../../../tests/vectors/version-2-compact.sgs", import.meta.url));
-    const outcomes = await ask(
-      page,
-      new Function(
-        "player",
-        `return (async () => {
-          const whole = Uint8Array.from(atob("${vector.toString("base64")}"), (letter) => letter.charCodeAt(0));
-          const found = { pictures: 0, sentences: 0, neither: 0 };
-          const played = async (bytes) => {
-            let fatal = false;
-            const off = player.on("error", (error) => { fatal ||= error.fatal; });
-            let ended = false;
-            const offEnd = player.on("ended", () => { ended = true; });
-            player.load(new Blob([bytes]));
-            player.play();
-            for (let i = 0; i < 400 && !fatal && !ended; i++) await new Promise((resolve) => setTimeout(resolve, 10));
-            off(); offEnd();
-            found[ended ? "pictures" : fatal ? "sentences" : "neither"]++;
-          };
-          for (let at = 3; at < whole.length; at += 787) {
-            const flipped = whole.slice();
-            flipped[at] ^= 1 << (at & 7);
-            await played(flipped);
-            await played(whole.slice(0, at));
-          }
-          return found;
-        })()`,
-      ) as never,
-    );
-    const { pictures, sentences, neither } = outcomes as unknown as Record<string, number>;
-    expect(pictures).toBeGreaterThan(0);
-    expect(sentences).toBeGreaterThan(0);
-    expect(neither).toBe(0);
-  });
-
-  test("says what statuses 404 and 403 mean", async () => {
-    stage.server.put("/none.sgs", "", { status: 404 });
-    stage.server.put("/mine.sgs", "", { status: 403 });
-    const page = await stage.open('src="none.sgs"');
-    const alert = page.getByRole("alert");
-    await alert.getByText("none.sgs was not found on the server (404). Check the address.").waitFor();
-    await ask(page, (player) => player.load("mine.sgs"));
-    await alert.getByText("The server refuses mine.sgs to this page (403).").waitFor();
-    stage.expectComplaints(/40[34]/);
   });
 
   test("says what is wrong with another version, another file, and another origin", async () => {

@@ -120,23 +120,6 @@ export async function ended(page: Page, timeout = 30_000): Promise<void> {
   await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout });
 }
 
-/** What a page takes must be the same before and after something: garbage aside, memory, workers and textures. */
-export async function expectSteady(page: Page, before: () => Promise<unknown>, after: () => Promise<unknown>) {
-  const client = await page.context().newCDPSession(page);
-  const state = async () => {
-    await client.send("HeapProfiler.collectGarbage");
-    const { usedSize } = await client.send("Runtime.getHeapUsage");
-    const counts = await ask(page, (player) => player.resources);
-    return { usedSize, workers: page.workers().length, ...counts };
-  };
-  await before();
-  const first = await state();
-  await after();
-  const last = await state();
-  expect({ ...last, usedSize: 0 }).toEqual({ ...first, usedSize: 0 });
-  expect(last.usedSize).toBeLessThan(first.usedSize * 1.1 + 2e5);
-}
-
 /** The messages of an event that the player has reported. */
 export function reported(page: Page, event: "error" | "notice" = "error"): Promise<string[]> {
   return page.evaluate((name) => heard.reported.filter(([one]) => one === name).map(([, message]) => message), event);
