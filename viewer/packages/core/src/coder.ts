@@ -5,9 +5,9 @@ import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, fieldIn } from "./fields.js";
 import { decodedSymbols } from "./rans.js";
-import { RESIDUAL_ALPHABET, residualsOf } from "./residualSymbols.js";
 import { decodedTables, type FrequencyTables, geometric } from "./tables.js";
 
+const RESIDUAL_ALPHABET = 16; // 0, -1, 1 ... -7, 7; the last symbol is not used
 const CLASSES = 32; // bit lengths of natural numbers below 2^31
 const FLAT = 128; // geometric row of a context that has not occurred
 
@@ -25,10 +25,13 @@ export class Decoder {
     this.left = new Map(fields);
   }
 
-  /** Signed numbers `[n]` of 32 bits. */
+  /** Signed numbers `[n]` from -7 to 7. */
   residuals(name: string, contexts: Uint8Array, count: number): Int32Array {
     const symbols = this.section(name, contexts, count, RESIDUAL_ALPHABET);
-    return residualsOf(symbols, this.taken(name, this.number(name)), `${this.where}, ${name},`);
+    if (this.number(name) || symbols.includes(RESIDUAL_ALPHABET - 1)) {
+      throw new StreamError(`${this.where}, ${name}, holds a residual beyond 7; it is damaged.`);
+    }
+    return Int32Array.from(symbols, (symbol) => (symbol & 1 ? -((symbol + 1) >> 1) : symbol >> 1));
   }
 
   /** Numbers `[n]` from 0 to below 2^31. */

@@ -3,10 +3,10 @@
 
 import { expect, test } from "vitest";
 import { BitReader } from "../src/bits.ts";
+import { Decoder } from "../src/coder.ts";
 import { Arithmetic, Model, NUMBER_NODES } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
 import { decodedSymbols } from "../src/rans.ts";
-import { residualsOf } from "../src/residualSymbols.ts";
 import { decodedTables, geometricRow } from "../src/tables.ts";
 
 const SECTION = Uint8Array.of(0x04, 0x04, 0x00, 0xb8, 0x97, 0x00, 0x01, 0x50);
@@ -55,24 +55,18 @@ test("the geometric family", () => {
   }
 });
 
-test("escapes", () => {
-  const found = residualsOf(Uint8Array.of(15, 0, 15, 13, 14, 15), Uint8Array.of(0x89, 0x48), "It");
-  expect([...found]).toEqual([8, 0, -8, -7, 7, 13]);
-  expect(() => residualsOf(Uint8Array.of(15), new Uint8Array(0), "It")).toThrow("It has 0 bytes for 1 values");
-  expect(() => residualsOf(Uint8Array.of(0), Uint8Array.of(0), "It")).toThrow("It has 1 bytes for 0 values");
-});
-
-test("the ends of 32 bits", () => {
-  const least = `${"0".repeat(28)}${(2 ** 31 - 8 + 4).toString(2)}1`;
-  const most = `${"0".repeat(28)}${(2 ** 31 - 9 + 4).toString(2)}0`;
-  const beyond = `${least.slice(0, -1)}0`;
-  const escapes = (text: string) => {
-    const padded = text.padEnd(8 * Math.ceil(text.length / 8), "0");
-    return Uint8Array.from(padded.match(/.{8}/g)!, (byte) => Number.parseInt(byte, 2));
+test("residuals beyond 7", () => {
+  const read = (symbol: number, more: number) => {
+    const section = Uint8Array.of(0x02, 0xb7, 0x80, 0x01, 0x00, 0xf0 + symbol, 0x0f, 0x00, 0x10, more);
+    return new Decoder(new Map([["anchor_offsets", section]]), "It").residuals(
+      "anchor_offsets.step",
+      new Uint8Array(1),
+      1,
+    );
   };
-  expect([...residualsOf(Uint8Array.of(15), escapes(least), "It")]).toEqual([-(2 ** 31)]);
-  expect([...residualsOf(Uint8Array.of(15), escapes(most), "It")]).toEqual([2 ** 31 - 1]);
-  expect(() => residualsOf(Uint8Array.of(15), escapes(beyond), "It")).toThrow("holds a value beyond 32 bits");
+  expect([...read(14, 0)]).toEqual([7]);
+  expect(() => read(15, 0)).toThrow("It, anchor_offsets.step, holds a residual beyond 7; it is damaged.");
+  expect(() => read(14, 1)).toThrow("It, anchor_offsets.step, holds a residual beyond 7; it is damaged.");
 });
 
 test("more zeros than an Exp-Golomb code may have, and a cut one", () => {
