@@ -8,6 +8,7 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.footage import find_footage, shared_seconds, shots_of, spread_moments
 from tests.support.captures import numbers, picture, write_picture, write_video, write_videos
 
@@ -76,8 +77,7 @@ def test_sound_is_on_the_pictures_clock(tmp_path: Path, delay_seconds: float) ->
     write_sound(tmp_path / "a.mkv", delay_seconds=delay_seconds)
     found = find_footage(tmp_path).audio("a")
     assert found is not None
-    samples, rate = found
-    assert np.abs(samples).argmax() / rate == pytest.approx(0.2, abs=0.002)
+    assert np.abs(found).argmax() / SAMPLE_RATE == pytest.approx(0.2, abs=0.002)
 
 
 def test_what_is_no_footage_is_reported(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ def test_pictures_of_what_stands_still_need_no_clocks(tmp_path: Path) -> None:
 def test_sound(tmp_path: Path) -> None:
     rig = write_room(tmp_path / "videos", cameras=4, frames=150)
     clocks = {name: Clock(0.31 * index) for index, name in enumerate(rig)}
-    for name, (samples, rate) in heard(clocks, seconds=5).items():
-        add_sound(tmp_path / "videos" / f"{name}.mp4", samples, rate)
+    for name, samples in heard(clocks, seconds=5).items():
+        add_sound(tmp_path / "videos" / f"{name}.mp4", samples)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out")
     found = read_prepared(tmp_path / "out")
     assert made.steps["synchronize"].startswith("audio: all cameras have sound")

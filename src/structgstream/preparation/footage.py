@@ -42,7 +42,6 @@ from structgstream.data.video import measured_fps, pictures_at
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.errors import CaptureError
 from structgstream.geometry import Indices
-from structgstream.opus import SAMPLE_RATE
 
 _log = logging.getLogger(__name__)
 
@@ -134,12 +133,9 @@ class Footage:
                 assert shown is not None, "a lost picture raises"
                 yield shown[0]
 
-    def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
-        """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound."""
-        if name not in self.tracks:
-            return None
-        samples = read_audio(self.files[name])
-        return None if samples is None else (samples, float(SAMPLE_RATE))
+    def audio(self, name: str) -> NDArray[np.float32] | None:
+        """Mono samples ``[N]`` at ``SAMPLE_RATE``; sample 0 is at time 0 of the stamps. None without sound."""
+        return read_audio(self.files[name]) if name in self.tracks else None
 
     def metadata(self, name: str) -> dict[str, str]:
         """What a camera's file states as text, by lower-case key; nothing for pictures."""

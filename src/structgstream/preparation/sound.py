@@ -174,7 +174,7 @@ def _clock_by_cameras(source: FrameSource, path: Path) -> Clock | None:
         if own is None or camera is None:
             continue
         try:
-            sounds = {name: sound_of(name, (own, SAMPLE_RATE)), FILE: sound_of(FILE, (samples, SAMPLE_RATE))}
+            sounds = {name: sound_of(name, own), FILE: sound_of(FILE, samples)}
         except UnusableSoundError:
             continue
         clocks += [_clock_of(lag, camera[1]) for lag in audio_lags(sounds) if lag.fine or not clocks]

@@ -15,6 +15,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock, counted_rate, period_seconds
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.geometry import Floats
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
@@ -213,7 +214,7 @@ def _by_audio(footage: Footage, stamps: Mapping[str, Floats], reason: str) -> Sy
         raise UnusableSoundError(f"Camera {mute!r} has no sound", "synchronise by motion or timestamps.csv")
     sounds = {name: sound_of(name, sound) for name, sound in recorded.items() if sound is not None}
     lags = audio_lags(sounds)
-    takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
+    takes = {name: (0.0, len(sound.samples) / SAMPLE_RATE) for name, sound in sounds.items()}
     groups = connected_by(list(takes), lags)
     if len(groups) > 1:
         others = ", ".join(repr(name) for group in groups[1:] for name in group)
