@@ -82,8 +82,6 @@ def test_the_same_board_gives_the_same_bytes_and_the_board_as_text(tmp_path: Pat
 def test_a_board_that_does_not_fit_says_what_would(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not fit A4, which has room for 285 x 184 mm; take squares of 36 mm"):
         write_board_pdf(tmp_path / "board.pdf", Board(7, 5, 0.05))
-    with pytest.raises(ConfigError, match="'A9' is no paper size"):
-        page(tmp_path, BOARD, "A9")
 
 
 @pytest.mark.parametrize(
