@@ -20,7 +20,6 @@ def solved(rig: dict[str, LensCamera], points: np.ndarray, seen: list[tuple[int,
 def test_errors_follow_the_lens() -> None:
     rig = ring(2, radius=2.6, arc_degrees=40, lens=RadialTangential(k1=-0.12))
     found = solved(rig, cloud(3), [(0, 0, (3.0, -4.0)), (0, 1, (0.0, 0.0)), (2, 1, (0.0, 1.0))])
-    np.testing.assert_allclose(found.residuals(), [[-3, 4], [0, 0], [0, -1]], atol=1e-9)
     np.testing.assert_allclose(found.errors(), [5, 0, 1], atol=1e-9)
     assert found.track_lengths().tolist() == [2, 0, 1]
 

@@ -90,7 +90,7 @@ def test_a_camera_of_another_take_is_left_out() -> None:
 
 
 def test_two_seconds_of_activity_without_geometry_are_refused_or_right() -> None:
-    pairs = pair_signals(changes(), None)
+    pairs = pair_signals(changes(), CalibratedGeometry({}))
     assert not any(pair.epipolar for pair in pairs)
     group, solution, _ = agreeing_cameras(takes(), pairs, slack_seconds=1 / 60)
     if solution is not None:

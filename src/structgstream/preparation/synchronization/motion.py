@@ -289,14 +289,14 @@ class PairSignals:
     estimated: bool = False  # whether the epipolar geometry is an estimate that may be wrong
 
 
-def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:
+def pair_signals(changes: Mapping[str, Changes], geometry: Geometry) -> list[PairSignals]:
     """Signals of all pairs of cameras in which something moves: of epipolar lines where the geometry is known."""
     moving = [name for name, change in changes.items() if change.moving]
     found = []
     for first, second in combinations(moving, 2):
         one, other = changes[first], changes[second]
         step = min(period_seconds(one.times), period_seconds(other.times))
-        pair = geometry.pair(first, second) if geometry else None
+        pair = geometry.pair(first, second)
         values = line_signals(one, other, pair) if pair else None
         both = values or (one.activity, other.activity)
         signals = resampled(both[0], one.times, step=step), resampled(both[1], other.times, step=step)
