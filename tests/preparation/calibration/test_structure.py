@@ -99,12 +99,6 @@ def test_cameras_that_see_nothing_in_common_are_refused() -> None:
         solve_structure({f"cam{index}": [noise(index)[:120, :160]] for index in range(3)})
 
 
-def test_two_cameras_are_refused() -> None:
-    _, pictures = filmed_room()
-    with pytest.raises(CalibrationError, match="three cameras or more, got cameras 'cam00', 'cam01'"):
-        solve_structure({name: pictures[name] for name in ("cam00", "cam01")})
-
-
 def test_shared_intrinsics_of_two_sizes_are_refused() -> None:
     _, pictures = filmed_room()
     smaller = pictures | {"cam04": [np.ascontiguousarray(pictures["cam04"][0][::2, ::2])]}

@@ -328,7 +328,7 @@ def estimated(bundle: Bundle, parameters: Parameters) -> tuple[Bundle, Parameter
     """Adjusted, with the noise and the differences of lenses that fit best."""
     poses = bundle.columns[0]
     bundle = _with_noise(bundle, parameters)
-    for _ in range(ROUNDS if bundle.free else 1):
+    for _ in range(ROUNDS):
         parameters = solved(bundle, parameters, max_steps=STEPS)
         covariance = linearized(bundle, parameters).covariance()
         prior = bundle.prior.updated(parameters.rows, covariance, start=poses, free=bundle.free)

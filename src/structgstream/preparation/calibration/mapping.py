@@ -131,11 +131,16 @@ def size_of(model: Any, stills: Collection[str]) -> tuple[int, int, int]:
     return sum(name in stills for name in names), len(names), model.compute_num_observations()
 
 
-def _incremental_options() -> Any:
+def _repeatable_options() -> Any:
     options = pycolmap_module().IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
+    return options
+
+
+def _incremental_options() -> Any:
+    options = _repeatable_options()
     options.min_model_size = 2
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = True
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = True
@@ -273,10 +278,7 @@ def posed_model(
     model = pycolmap.Reconstruction()
     for camera in numbered.values():
         model.add_camera_with_trivial_rig(camera)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
-    options.extract_colors = False
+    options = _repeatable_options()
     options.mapper.filter_max_reproj_error = pixels
     making = options.triangulation
     making.create_max_angle_error = making.continue_max_angle_error = slack_degrees

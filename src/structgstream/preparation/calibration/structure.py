@@ -79,7 +79,8 @@ def solve_structure(
     """Poses, intrinsics and lenses of still cameras from their own pictures.
 
     Args:
-        pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras, in order of time.
+        pictures: camera name, of three or more, to pictures ``[H, W, 3]`` of the same instants for all cameras, in
+            order of time.
         lens: which distortion is estimated.
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         focals: focal lengths in pixels by name, of those cameras that state one. Fields of view that are tried begin
@@ -93,15 +94,9 @@ def solve_structure(
         observations are those of the still cameras.
 
     Raises:
-        CalibrationError: fewer than three cameras, pictures that do not belong together, too little in common, or no
-            roving frame that has.
+        CalibrationError: pictures that do not belong together, too little in common, or no roving frame that has.
     """
     pycolmap_module()
-    if len(pictures) < 3:
-        raise CalibrationError(
-            f"Structure from motion needs three cameras or more, got {listed(pictures)}: two of them do not fix "
-            "their focal lengths; film a board with both (structgstream board), or add a camera."
-        )
     workers = max(1, min(len(pictures), os.cpu_count() or 1))
     keypoints = all_keypoints(pictures, workers=workers)
     matches = all_matches(keypoints, workers=workers)
