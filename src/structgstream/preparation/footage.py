@@ -18,7 +18,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from structgstream.data.camera_files import (
     other_roots,
 )
 from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
-from structgstream.data.posed_capture import filmed_roots
+from structgstream.data.posed_capture import PICTURE_FPS, filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.sound import read_audio
 from structgstream.data.timeline import Clock, natural, picture_slots
@@ -45,7 +44,6 @@ from structgstream.geometry import Indices
 
 _log = logging.getLogger(__name__)
 
-PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
 FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | UNREAD
 """What a camera may have written, also in ways that are not read here."""
@@ -77,10 +75,6 @@ class Footage:
     def fps(self) -> float:
         """Frames a second by time stamp; of pictures, what was stated."""
         return (measured_fps(self.tracks) if self.tracks else None) or self.picture_fps
-
-    def path(self, name: str) -> Path:
-        """The camera's video or folder, for messages."""
-        return self.files[name]
 
     def size(self, name: str) -> tuple[int, int]:
         """Width and height of a camera's pictures, pixels."""
@@ -287,13 +281,7 @@ class Shots(Sequence[Picture]):
     def __len__(self) -> int:
         return len(self.indices)
 
-    @overload
-    def __getitem__(self, number: int) -> Picture: ...
-    @overload
-    def __getitem__(self, number: slice) -> "Shots": ...
-    def __getitem__(self, number: int | slice) -> "Picture | Shots":
-        if isinstance(number, slice):
-            return Shots(self.footage, self.camera, self.indices[number])
+    def __getitem__(self, number: int) -> Picture:  # pyright: ignore[reportIncompatibleMethodOverride]  (no slices)
         return next(self.footage.pictures(self.camera, [self.indices[number]]))
 
 
@@ -310,8 +298,8 @@ def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float
     if first > last + 1e-6:
         lengths = [f"{spans[name][1] - spans[name][0]:.3f} s" for name in (early, late)]
         raise CaptureError(
-            f"The cameras of {footage.where} have no moment in common: {footage.path(early).name} of camera {early!r} "
-            f"ends {first - last:.3f} s before {footage.path(late).name} of camera {late!r} begins (lengths "
+            f"The cameras of {footage.where} have no moment in common: {footage.files[early].name} of camera {early!r} "
+            f"ends {first - last:.3f} s before {footage.files[late].name} of camera {late!r} begins (lengths "
             f"{lengths[0]} and {lengths[1]}); give longer videos, or leave one camera out with --without."
         )
     return first, last

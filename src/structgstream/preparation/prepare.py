@@ -107,7 +107,7 @@ class Job:
         self._check_names(options.without, footage, purpose="leave out")
         # A roving video that lies among the others is none of the still cameras'.
         walked = None if options.roving is None else options.roving.resolve()
-        still = [name for name in footage.cameras if footage.path(name).resolve() != walked]
+        still = [name for name in footage.cameras if footage.files[name].resolve() != walked]
         footage = footage.only([name for name in still if name not in options.without])
         self._check_names(held_out, footage, purpose="hold out")
         self._check_names(
@@ -228,7 +228,7 @@ class Job:
         for number, (name, camera) in enumerate(content.cameras.items()):
             self.steps.progress(number, len(content.cameras), name)
             target = self.capture / camera.files
-            source = footage.path(name)
+            source = footage.files[name]
             if not footage.tracks and source.is_file():
                 target = target / source.name
             link(source, target, how=self.options.link)
@@ -478,7 +478,7 @@ def assembled(
     for name in footage.cameras:
         filmed = solved.cameras[name]
         pinhole = rectilinear(filmed, degrees=options.field_of_view, size=options.size)
-        where = f"videos/{name}{footage.path(name).suffix.lower()}" if footage.tracks else f"pictures/{name}"
+        where = f"videos/{name}{footage.files[name].suffix.lower()}" if footage.tracks else f"pictures/{name}"
         cameras[name] = PreparedCamera(where, filmed, pinhole, clocks.get(name, Clock()))
     rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
     held_out = held_out_of(options, rig)
