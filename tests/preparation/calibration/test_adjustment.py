@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-import logging
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from structgstream.cameras import Camera
@@ -52,16 +50,14 @@ def guessed(truth: SolvedCalibration) -> SolvedCalibration:
     return replace(truth, cameras=cameras)
 
 
-def test_lenses_of_phones_are_reported_from_focal_lengths(caplog: pytest.LogCaptureFixture) -> None:
+def test_lenses_of_phones_are_found_from_focal_lengths() -> None:
     truth, wrong = rig()
-    with caplog.at_level(logging.INFO):
-        found = adjust_together(guessed(truth), lens=range(CAMERAS), free=FREE, limits=LIMITS)
+    found = adjust_together(guessed(truth), lens=range(CAMERAS), free=FREE, limits=LIMITS)
     errors = calibration_errors(found.cameras, truth.cameras).values()
     assert np.median([abs(error.focal_percent) for error in errors]) < 0.4
     assert np.median([error.lens_pixels for error in errors]) < 1.0
     lost = len(wrong) - len(found.observations)
     assert wrong.sum() <= lost < 1.5 * wrong.sum()
-    assert f"{wrong.sum()} of {len(wrong)} observations removed (cam0 " in caplog.text
 
 
 def test_shared_lenses_stay_so() -> None:

@@ -6,7 +6,6 @@ from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a mode
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_terms.py``)."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -228,8 +227,6 @@ def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floa
     )
 
 
-_log = logging.getLogger(__name__)
-
 MAX_PIXELS = 3.0
 ROUNDS, STEPS, SAME = 8, 2, 0.05
 NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
@@ -265,7 +262,6 @@ def adjust_together(
         found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions
     )
     inliers = cleaned(adjusted, limits)
-    _log_adjustment(adjusted, inliers, bundle)
     again, parameters = _problem(inliers, bundle.lens, bundle.free, makes)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
     parameters = solved(again, parameters)
@@ -371,14 +367,3 @@ def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
         angle = np.arctan2(sine, (rays[step:] * rays[:-step]).sum(1))
         np.maximum.at(widest, points[step:][same], angle[same])
     return widest
-
-
-def _log_adjustment(before: SolvedCalibration, after: SolvedCalibration, bundle: Bundle) -> None:
-    counts = [np.bincount(own.observations.camera, minlength=len(own.cameras)) for own in (before, after)]
-    lost = {name: int(count) for name, count in zip(before.cameras, counts[0] - counts[1], strict=True) if count}
-    _log.info(
-        "Adjusted: noise %.2f pixels, %d of %d observations removed (%s), lenses of a group differ by %s.",
-        bundle.noise, int(sum(lost.values())), len(before.observations),
-        ", ".join(f"{name} {count}" for name, count in lost.items()) or "none",
-        dict(zip(bundle.prior.terms, bundle.prior.differences.round(5).T.tolist(), strict=True)),
-    )  # fmt: skip

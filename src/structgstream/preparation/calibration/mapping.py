@@ -8,7 +8,6 @@ walls, at one depth, where a camera's place can be exchanged for its focal lengt
 near the epipolar lines of the first solution are more, and of more depths.
 """
 
-import logging
 import os
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -34,8 +33,6 @@ from structgstream.preparation.calibration.keypoints import (
     guided_matches,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-
-_log = logging.getLogger(__name__)
 
 Matches = Mapping[Pair, NDArray[np.uint32]]
 
@@ -330,13 +327,10 @@ def rematched(
     made = triangulated(graph, found.cameras, limits=limits)
     made = replace(found, points=made.points, observations=made.observations)
     joined = _joined(_confirmed(made), _confirmed(found))
-    again = adjust(joined) if len(joined.observations) >= MIN_GAIN * before.sum() else found
-    after = _counts(again)
-    if again is found or (after < before).any():
-        _log.info("Matching again gives a camera hardly more or fewer observations; the first solution stays.")
+    if len(joined.observations) < MIN_GAIN * before.sum():
         return found
-    _log.info("Matched again: %d observations in place of %d.", after.sum(), before.sum())
-    return again
+    again = adjust(joined)
+    return found if (_counts(again) < before).any() else again
 
 
 def _counts(found: SolvedCalibration) -> Indices:
