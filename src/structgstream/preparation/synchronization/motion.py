@@ -461,8 +461,7 @@ def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> lis
     line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
     if line is None:
         return []
-    min_overlap = MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
-    sigma = max(line.lag_sigma, min_overlap)
+    sigma = max(line.lag_sigma, MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2)
     if line.rate is None:
         return [_line_match(pair, line, 0.0, sigma)]
     sigma = max(sigma, line.rate_sigma * line.spread_seconds)
