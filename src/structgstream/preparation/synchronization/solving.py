@@ -277,7 +277,7 @@ def _with_rates(
         errors = np.sqrt(_relative_variances(covariance, graph.cameras)[1])
         # Rates are relative: compared with the median, cameras of one kind of clock keep rate 1 together.
         relative = corrections - (np.median(corrections) if free.all() else 0.0)
-        effect = np.abs(relative) * 2 * halves * (2 if graph.cameras == 2 else 1)
+        effect = np.abs(relative) * 2 * halves
         strength = np.minimum(np.abs(relative) / (RATE_SIGMAS * errors + 1e-300), effect / RATE_EFFECT_SECONDS)
         weak = np.flatnonzero(free & (strength < 1))
         if not len(weak):
