@@ -10,7 +10,7 @@ from matplotlib.lines import AxLine
 
 from structgstream.pose_check.tracks import pair_errors
 from structgstream.preparation import report as overlays
-from structgstream.preparation.checking.check import Checked, check_capture, examine
+from structgstream.preparation.checking.check import Checked, check_capture
 from tests.support.evidence_made import turned
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import room_frame, room_rig
@@ -34,15 +34,6 @@ def test_pairs_are_the_worst_of_who_is_off_then_the_worst_and_the_surest(checked
     assert pairs[0] == max((pair for pair in errors if OFF in pair), key=lambda pair: errors[pair].pixels)
     assert max(errors, key=lambda pair: errors[pair].pixels) in pairs[:2]
     assert max(errors, key=lambda pair: errors[pair].matches) in pairs
-
-
-def test_where_nobody_is_off_the_worst_pair_is_shown_all_the_same() -> None:
-    rig = room_rig(4)
-    examined = examine(room_frame(rig), rig.cameras)
-    errors = pair_errors(examined.evidence, examined.cameras)
-    first, *others = overlays.chosen_pairs(examined)
-    assert first == max(errors, key=lambda pair: errors[pair].pixels)
-    assert [errors[pair].matches for pair in others] == sorted((errors[pair].matches for pair in others), reverse=True)
 
 
 def lines_and_marks(axis: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
