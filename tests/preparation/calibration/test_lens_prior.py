@@ -42,9 +42,3 @@ def test_the_cost_has_the_gradient_and_the_curvature_that_are_added() -> None:
     step[:, ACROSS] = np.random.default_rng(1).normal(size=LENSES) * 1e-3
     flat = step[:, list(FREE)].ravel()
     assert prior.cost(own + step) - prior.cost(own) == pytest.approx(gradient @ flat + flat @ A @ flat / 2)
-
-
-def test_terms_without_a_prior_cost_nothing() -> None:
-    prior = usual_prior(np.zeros(LENSES, np.intp), (FOCAL,), fisheye=False)
-    assert prior.terms == ()
-    assert prior.cost(rows(0.3, 0.1)) == 0
