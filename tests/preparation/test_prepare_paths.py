@@ -10,7 +10,7 @@ import pytest
 
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CalibrationError
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Job, Preparation, prepare_capture
@@ -81,8 +81,6 @@ def test_pictures_of_what_stands_still_need_no_clocks(tmp_path: Path) -> None:
     for name, pictures in matched_pictures(footage, clocks, PrepareOptions()).items():
         assert len(pictures) == 1
         assert np.abs(pictures[0].astype(int) - still[name]).max() <= 4
-    with pytest.raises(CaptureError, match="share no clock"):
-        first_clocks(footage, PrepareOptions(synchronize="stamps"))
 
 
 @pytest.mark.usefixtures("without_points", "without_check")
@@ -145,6 +143,3 @@ def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
     with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
-    write_videos(tmp_path / "board", ["a", "b"], frames=2)
-    with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, board_videos=tmp_path / "board"))
