@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.geometry import Indices
-from structgstream.preparation.calibration.bundle import Limits, chosen
+from structgstream.preparation.calibration.bundle import MIN_DEGREES, chosen
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
     Keypoints,
@@ -182,9 +182,9 @@ def adjust(model: Any, *, lens: bool = True) -> None:
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
-def filtered(model: Any, *, pixels: float, degrees: float) -> int:
-    """Removes observations with a larger reprojection error and points with a smaller angle; returns how many."""
-    return pycolmap_module().ObservationManager(model).filter_all_points3D(pixels, degrees)
+def filter_model(model: Any, *, pixels: float) -> None:
+    """Removes observations with a larger reprojection error, and points whose rays have too small an angle."""
+    pycolmap_module().ObservationManager(model).filter_all_points3D(pixels, MIN_DEGREES)
 
 
 def cameras_of(model: Any) -> dict[str, LensCamera]:
@@ -244,10 +244,10 @@ def posed_graph(
     return PosedGraph(keypoints, verified_pairs(keypoints, near, numbered, workers=workers))
 
 
-def triangulated(graph: PosedGraph, cameras: Mapping[str, LensCamera], *, limits: Limits) -> SolvedCalibration:
-    """The cameras with the points of the graph's matches, without observations that exceed the limits."""
-    model = posed_model(graph, cameras, pixels=limits.pixels, slack_degrees=SLACK_DEGREES)
-    filtered(model, pixels=limits.pixels, degrees=limits.degrees)
+def triangulated(graph: PosedGraph, cameras: Mapping[str, LensCamera], *, pixels: float) -> SolvedCalibration:
+    """The cameras with the points of the graph's matches, without observations that are more than ``pixels`` off."""
+    model = posed_model(graph, cameras, pixels=pixels, slack_degrees=SLACK_DEGREES)
+    filter_model(model, pixels=pixels)
     points, observations = observed(model, graph.keypoints, cameras)
     return SolvedCalibration(dict(cameras), points, observations)
 
@@ -307,16 +307,17 @@ def rematched(
     found: SolvedCalibration,
     keypoints: Mapping[str, Keypoints],
     *,
-    limits: Limits,
+    pixels: float,
     adjust: Callable[[SolvedCalibration], SolvedCalibration],
     workers: int,
 ) -> SolvedCalibration:
     """The first solution ``found`` adjusted to more points (Note [What a first solution lacks]); itself if it has
-    enough, little is gained or a camera loses some. ``adjust`` adjusts cameras and points together."""
+    enough, little is gained or a camera loses some. Observations may be ``pixels`` off; ``adjust`` adjusts cameras and points
+    together."""
     before = _counts(found)
     if before.min() >= ENOUGH:
         return found
-    guided = guided_matches(keypoints, found.cameras, pixels=limits.pixels, workers=workers)
+    guided = guided_matches(keypoints, found.cameras, pixels=pixels, workers=workers)
     pycolmap, geometries = pycolmap_module(), {}
     for pair, rows in guided.items():
         if len(rows):
@@ -324,7 +325,7 @@ def rematched(
             geometries[pair].config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometries[pair].inlier_matches = rows
     graph = PosedGraph({name: keypoints[name] for name in found.cameras}, geometries)
-    made = triangulated(graph, found.cameras, limits=limits)
+    made = triangulated(graph, found.cameras, pixels=pixels)
     made = replace(found, points=made.points, observations=made.observations)
     joined = _joined(_confirmed(made), _confirmed(found))
     if len(joined.observations) < MIN_GAIN * before.sum():
