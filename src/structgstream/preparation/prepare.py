@@ -459,11 +459,6 @@ def _described(footage: Footage) -> str:
     return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"
 
 
-def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
-    """The cameras to hold out."""
-    return frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
-
-
 def assembled(
     footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, options: PrepareOptions
 ) -> PreparedCapture:
@@ -481,7 +476,7 @@ def assembled(
         where = f"videos/{name}{footage.files[name].suffix.lower()}" if footage.tracks else f"pictures/{name}"
         cameras[name] = PreparedCamera(where, filmed, pinhole, clocks.get(name, Clock()))
     rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
-    held_out = held_out_of(options, rig)
+    held_out = frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
     walked = {} if solved.roving is None else solved.roving.cameras
     roving = {name: PreparedCamera(f"{name}.png", filmed, rectilinear(filmed)) for name, filmed in walked.items()}

@@ -312,8 +312,8 @@ def rematched(
     workers: int,
 ) -> SolvedCalibration:
     """The first solution ``found`` adjusted to more points (Note [What a first solution lacks]); itself if it has
-    enough, little is gained or a camera loses some. Observations may be ``pixels`` off; ``adjust`` adjusts cameras and points
-    together."""
+    enough, little is gained or a camera loses some. Observations may be ``pixels`` off; ``adjust`` adjusts cameras and
+    points together."""
     before = _counts(found)
     if before.min() >= ENOUGH:
         return found
