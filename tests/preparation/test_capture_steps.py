@@ -15,7 +15,7 @@ from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import FOLDER, Silent, Steps
-from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method, held_out_of
+from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method
 from structgstream.preparation.solvers import given_cameras
 from tests.support.rooms import write_room
 
@@ -75,7 +75,6 @@ def test_who_is_held_out(tmp_path: Path) -> None:
     assert content.held_out == {"cam01", "cam03"}
     _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("auto",)))
     assert len(content.held_out) == 1
-    assert held_out_of(replace(NONE, held_out=()), None) == frozenset()  # pyright: ignore[reportArgumentType]
 
 
 def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:

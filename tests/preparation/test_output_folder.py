@@ -24,6 +24,7 @@ from structgstream.preparation.output_folder import (
     unlink,
 )
 from tests.support.killed import folders_of_the_killed
+from tests.support.quick_preparation import Heard
 
 
 @pytest.fixture
@@ -272,22 +273,6 @@ def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
     before = fingerprint(files)
     (tmp_path / "b" / "d" / "e").write_text("deeper")
     assert fingerprint(files) != before
-
-
-class Heard:
-    """A listener that records all calls."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[object, ...]] = []
-
-    def begin(self, step: str, *, skipped: bool) -> None:
-        self.calls.append(("begin", step, skipped))
-
-    def progress(self, done: int, total: int, what: str) -> None:
-        self.calls.append(("progress", done, total, what))
-
-    def end(self, step: str, summary: str) -> None:
-        self.calls.append(("end", step, summary))
 
 
 def test_steps_are_reported_and_their_summaries_recorded(tmp_path: Path) -> None:
