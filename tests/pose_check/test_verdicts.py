@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras are off, from matches of made rigs.
 
-Who is off, by errors of pairs that are made up; what errors mean is tried in ``test_check``.
+Who is off, by errors of pairs that are made up; what errors mean is tried in ``test_tracks``.
 """
 
 from collections.abc import Callable, Collection, Mapping

@@ -113,7 +113,11 @@ class Job:
         self._check_names(
             () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
         )
-        check_enough(footage)
+        if len(footage.cameras) < MIN_SOLVED:
+            raise CalibrationError(
+                f"{self.videos} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
+                "cameras cannot confirm each other's calibration: film with more."
+            )
         if len(footage.cameras) - len(set(held_out)) < MIN_CAMERAS:
             raise ConfigError(
                 f"{self.videos} has {len(footage.cameras)} cameras, {len(set(held_out))} of them held out; a "
@@ -438,15 +442,6 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
             "the pictures, choose --calibration sfm, or leave out --lens."
-        )
-
-
-def check_enough(footage: Footage) -> None:
-    """Refuses too few cameras for poses that can be checked."""
-    if len(footage.cameras) < MIN_SOLVED:
-        raise CalibrationError(
-            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
-            "cameras cannot confirm each other's calibration: film with more."
         )
 
 
