@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.timeline import Clock
 from structgstream.geometry import Floats
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.synchronization.audio import audio_lags, connected_by, solve_by_audio, sound_of
 
 HERTZ = 96_000  # of the made sound
@@ -35,7 +36,6 @@ class Case:
         snr_db: of each microphone.
         reverberation: seconds in which echoes fall by 60 dB.
         drift_ppm: standard deviation of the clocks' rates.
-        rates: samples a second, in turns.
     """
 
     title: str
@@ -47,7 +47,6 @@ class Case:
     snr_db: float = 10.0
     reverberation: float = 0.4
     drift_ppm: float = 0.0
-    rates: tuple[int, ...] = (44_100, 48_000)
     seed: int = 0
 
 
@@ -68,11 +67,11 @@ def main() -> None:
         begun = time.process_time()
         sounds = {name: sound_of(name, sound) for name, sound in recorded.items()}
         lags = audio_lags(sounds)
-        takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
+        takes = {name: (0.0, len(sound.samples) / SAMPLE_RATE) for name, sound in sounds.items()}
         if len(connected_by(list(takes), lags)) > 1:
             print(f"{case.title:30} not connected")
             continue
-        found = solve_by_audio(takes, lags, drift=case.drift_ppm > 0)
+        found = solve_by_audio(takes, lags)
         clocks = {name: Clock(found.offsets[name], found.rates[name]) for name in takes}
         error = largest_error(clocks, truth, takes)
         sigma = float(np.mean(list(found.sigmas.values())))
@@ -94,8 +93,8 @@ def largest_error(
     return worst
 
 
-def made(case: Case) -> tuple[dict[str, tuple[NDArray[np.float32], float]], dict[str, Clock]]:
-    """What each camera records with its rate, and its clock."""
+def made(case: Case) -> tuple[dict[str, NDArray[np.float32]], dict[str, Clock]]:
+    """What each camera records, and its clock."""
     from scipy.signal import fftconvolve
 
     generator = np.random.default_rng(case.seed)
@@ -109,12 +108,11 @@ def made(case: Case) -> tuple[dict[str, tuple[NDArray[np.float32], float]], dict
         echoes[: round(0.002 * HERTZ)] = 0
         echoes[0] = 1
         heard = fftconvolve(source, echoes)[: len(source)]
-        rate = case.rates[number % len(case.rates)]
-        at = clock.common_seconds(np.arange(round(case.seconds * rate)) / rate) * HERTZ
+        at = clock.common_seconds(np.arange(round(case.seconds * SAMPLE_RATE)) / SAMPLE_RATE) * HERTZ
         samples = np.interp(at, np.arange(len(heard)), heard) * 10 ** generator.uniform(-1, 0)
         noise = np.sqrt(np.mean(samples**2)) * 10 ** (-case.snr_db / 20)
         samples += noise * generator.normal(size=len(samples))
-        recorded[f"cam{number}"], clocks[f"cam{number}"] = (samples.astype(np.float32), float(rate)), clock
+        recorded[f"cam{number}"], clocks[f"cam{number}"] = samples.astype(np.float32), clock
     return recorded, clocks
 
 

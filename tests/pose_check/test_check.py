@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.open import open_capture
 from structgstream.data.source import resized
@@ -17,7 +17,7 @@ from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import Finding, check_poses, explain
 from structgstream.pose_check.verdicts import judge
-from tests.support.evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
+from tests.support.evidence_made import Cameras, evidence_of, farther, scattered, turned, wide_ring
 from tests.support.planes import room_frame, room_rig
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -26,12 +26,6 @@ FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 def explained(stated: Cameras, *, true: Cameras) -> list[Finding]:
     evidence = evidence_of(true, scattered(80), noise=0.2)
     return explain(evidence, stated, judge(evidence, stated))
-
-
-def farther(camera: Camera, factor: float) -> Camera:
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] *= factor
-    return replace(camera, viewmat=viewmat)
 
 
 def test_three_names_that_went_round_are_reported_one_by_one() -> None:
@@ -83,19 +77,6 @@ def test_the_mistake_of_one_camera_is_found_among_all(stated: object, descriptio
     assert found.cameras == ("cam3",)
     assert found.severity == "error"
     assert description in found.sentence
-
-
-def test_poses_of_another_rig_are_reported_as_such() -> None:
-    """Most disagree, and no reading of all poses explains it."""
-    true = wide_ring(6)
-    generator = np.random.default_rng(1)
-    wrong = {
-        name: turned(turned(camera, generator.uniform(10, 40)), generator.uniform(10, 40), axis=0)
-        for name, camera in true.items()
-    }
-    (found,) = explained(wrong, true=true)
-    assert "do not belong together" in found.sentence
-    assert found.cameras == tuple(true)
 
 
 CLIP = resized(bundled_clip(), 0.6)
@@ -168,16 +149,10 @@ def permuted(rig: CameraRig, names: list[str]) -> CameraRig:
     return rig.mapped({name: replace(rig[name], viewmat=poses.get(name, rig[name].viewmat)) for name in rig})
 
 
-@pytest.mark.parametrize("wrong", [["cam02", "cam03"], ["cam01", "cam05", "cam08"]])
-def test_exchanged_cameras_are_named(
-    clip_frame: MultiViewFrame, wrong: list[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    check_poses(clip_frame, permuted(CLIP.rig, wrong))
-    assert [name for name in CLIP.rig if repr(name) in caplog.text] == wrong
-    assert f"Names of cameras are exchanged: the pictures of {wrong[0]!r}" in caplog.text or (
-        f"The names of cameras {wrong[0]!r} and {wrong[1]!r} are exchanged" in caplog.text
-    )
-    caplog.clear()
+def test_exchanged_cameras_are_named(clip_frame: MultiViewFrame, caplog: pytest.LogCaptureFixture) -> None:
+    check_poses(clip_frame, permuted(CLIP.rig, ["cam02", "cam03"]))
+    assert [name for name in CLIP.rig if repr(name) in caplog.text] == ["cam02", "cam03"]
+    assert "The names of cameras 'cam02' and 'cam03' are exchanged" in caplog.text
 
 
 def test_wrong_matches_of_cameras_far_apart_accuse_nobody(caplog: pytest.LogCaptureFixture) -> None:

@@ -9,9 +9,9 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.matching import project
-from structgstream.geometry import Floats
 from structgstream.pose_check.tracks import Tracks
 from structgstream.pose_check.verdicts import Resection, explained, resect
+from tests.support.evidence_made import shifted, turned
 from tests.support.rigs import look_at
 
 NOISE = 0.3  # pixels
@@ -34,20 +34,6 @@ def observed(count: int = 120, *, wrong: float = 0.0, seed: int = 0) -> Tracks:
     return Tracks(("cam",), points, every, np.zeros(count, np.intp), pixels, np.zeros(count))
 
 
-def turned(camera: Camera, degrees: float) -> Camera:
-    angle = np.radians(degrees)
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[0, 0] = turn[2, 2] = float(np.cos(angle))
-    turn[0, 2], turn[2, 0] = float(np.sin(angle)), -float(np.sin(angle))
-    return replace(camera, viewmat=turn @ camera.viewmat)
-
-
-def moved(camera: Camera, by: Floats) -> Camera:
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] -= viewmat[:3, :3] @ torch.tensor(by)
-    return replace(camera, viewmat=viewmat)
-
-
 def of(given: Camera, tracks: Tracks) -> Resection:
     found = resect(tracks, given, "cam")
     assert found is not None
@@ -66,7 +52,7 @@ def test_a_turn_is_stated(degrees: float, wrong: float) -> None:
 
 
 def test_a_move_is_stated() -> None:
-    found = of(moved(true_camera(), np.array([0.0, 0.06, 0.0])), observed())
+    found = of(shifted(true_camera(), (0.0, 0.06, 0.0)), observed())
     assert found.better
     assert found.share_of_distance == pytest.approx(0.02, abs=0.003)
     assert found.degrees == 0

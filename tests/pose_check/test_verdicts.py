@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras are off, from matches of made rigs.
 
-Who is off, by errors of pairs that are made up; what errors mean is tried in ``test_check``.
+Who is off, by errors of pairs that are made up; what errors mean is tried in ``test_tracks``.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -15,7 +15,6 @@ from structgstream.data.matching import Pair, PairError
 from structgstream.pose_check import verdicts
 from structgstream.pose_check.tracks import Tracks
 from structgstream.pose_check.verdicts import (
-    MIN_MATCHES,
     Resection,
     Suspects,
     Verdict,
@@ -98,15 +97,6 @@ def test_all_cameras_written_the_wrong_way_round_are_one_mistake() -> None:
     assert not found.resections
 
 
-def test_few_matches_accuse_nobody() -> None:
-    """Fewer than chance may make: the camera is named as one that could not be checked, if at all."""
-    found = judged(lambda cameras: cameras.update(cam3=turned(cameras["cam3"], 3.0)), points=5)
-    assert found.suspects.off in ((), ("cam3",))
-    if not found.suspects.off:
-        assert found.unchecked in ((), ("cam3",))
-    assert 5 * len(RIG) < MIN_MATCHES
-
-
 GOOD, WRONG = PairError(0.3, 0.02, 80), PairError(6.0, 0.3, 80)
 
 
@@ -120,22 +110,11 @@ def verdict(errors: Mapping[Pair, PairError], count: int) -> Suspects:
     return find_suspects(errors, wide_ring(count))
 
 
-def test_no_camera_is_off_where_all_agree() -> None:
-    found = verdict(errors_of(5), 5)
-    assert (found.off, found.bad, found.everything) == ((), (), False)
-
-
-def test_the_camera_that_disagrees_with_all_is_off_and_nobody_else() -> None:
-    found = verdict(errors_of(6, ["cam4"]), 6)
-    assert found.off == ("cam4",)
-    assert set(found.bad) == {pair for pair in errors_of(6) if "cam4" in pair}
-    assert not found.everything
-
-
 def test_a_bad_pair_of_cameras_that_fit_others_is_stray() -> None:
     errors = errors_of(6, ["cam4"]) | {("cam0", "cam1"): PairError(200.0, 0.9, 21)}
     found = verdict(errors, 6)
     assert found.off == ("cam4",)
+    assert set(found.bad) == {pair for pair in errors if "cam4" in pair} | {("cam0", "cam1")}
     assert found.stray == (("cam0", "cam1"),)
     assert verdict(errors_of(6), 6).stray == ()
 
@@ -151,11 +130,6 @@ def test_of_equal_shares_the_larger_errors_come_first() -> None:
     errors = {("cam0", "cam1"): PairError(9.0, 0.3, 50), ("cam0", "cam2"): PairError(4.0, 0.3, 50)}
     errors |= {("cam1", "cam3"): PairError(8.0, 0.3, 50), ("cam2", "cam3"): GOOD}
     assert verdict(errors, 4).off == ("cam1", "cam0")
-
-
-def test_most_pairs_bad_is_no_single_cameras_mistake() -> None:
-    found = verdict(errors_of(6, [f"cam{number}" for number in range(5)]), 6)
-    assert found.everything
 
 
 def test_many_matches_do_not_outvote_other_pairs() -> None:

@@ -72,6 +72,8 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
         ("board", PrepareOptions(intrinsics="shared"), "by structure from motion alone"),
         (given, PrepareOptions(lens="fisheye"), r"cameras\.json states the lenses, so --lens fisheye has no effect"),
         ("sfm", PrepareOptions(board=Board(10, 7, 0.03)), r"A board \(--board\) is looked for by --calibration board"),
+        ("sfm", PrepareOptions(roving=tmp_path, refine=True), "adjusts the still cameras alone"),
+        (given, PrepareOptions(roving=tmp_path), "registered by structure from motion alone"),
         ("sfm", PrepareOptions(lens="brown", refine=True), "model brown cannot be refined; take --lens opencv"),
         ("board", PrepareOptions(board_videos=tmp_path / "nowhere"), "nowhere is missing; give the folder"),
     ):
@@ -95,7 +97,7 @@ def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -
     (tmp_path / "cameras.json").rename(tmp_path / "moved.json")
     (tmp_path / "calibration").mkdir()
     (tmp_path / "moved.json").rename(tmp_path / "calibration" / "cameras.json")
-    there = find(tmp_path)
+    there = find_footage(tmp_path)
     calibration = chosen_method(there, PrepareOptions(calibration=tmp_path / "calibration"))
     assert isinstance(calibration, Calibration)
     found = given_cameras(calibration, there)
@@ -105,7 +107,7 @@ def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -
     assert (len(found.points), len(found.observations)) == (0, 0)
     write_video(tmp_path / "cam03.mp4", [np.zeros((120, 160, 3), np.uint8)])
     with pytest.raises(CalibrationError, match="cam03"):
-        given_cameras(calibration, find(tmp_path))
+        given_cameras(calibration, find_footage(tmp_path))
 
 
 @pytest.mark.parametrize(("by_exif", "reason"), [(True, "turn them without loss"), (None, "export the pictures")])
@@ -123,14 +125,8 @@ def test_a_calibration_of_turned_pictures_is_refused_for_stored_ones(
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / f"{camera.name}.jpg", exif=exif)
     calibration = Calibration(tmp_path / "intri.yml", cameras, turned_by_exif=by_exif)
     with pytest.raises(CalibrationError, match=reason):
-        given_cameras(calibration, find(tmp_path))
-    assert len(given_cameras(replace(calibration, turned_by_exif=False), find(tmp_path)).cameras) == 3
-
-
-def find(where: Path) -> Footage:
-    from structgstream.preparation.footage import find_footage
-
-    return find_footage(where)
+        given_cameras(calibration, find_footage(tmp_path))
+    assert len(given_cameras(replace(calibration, turned_by_exif=False), find_footage(tmp_path)).cameras) == 3
 
 
 @pytest.mark.parametrize(

@@ -34,12 +34,11 @@ def job(room: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
 
 def run(job: Job) -> tuple[Clocks, SolvedCalibration]:
     """All steps with the calibration that lies beside the videos."""
-    steps = job
-    footage = steps.find()
+    footage = job.find()
     method = chosen_method(footage, job.options)
-    clocks = steps.synchronize(footage, method)
-    solved = steps.calibrate(footage, clocks, method)
-    assert steps.synchronize_again(footage, clocks, method, solved) is clocks
+    clocks = job.synchronize(footage, method)
+    solved = job.calibrate(footage, clocks, method)
+    assert job.synchronize_again(footage, clocks, method, solved) is clocks
     return clocks, solved
 
 
@@ -85,18 +84,6 @@ def test_too_few_cameras_claim_nothing(room: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_second_time_everything_is_there(room: Path, tmp_path: Path) -> None:
-    first = run(job(room, tmp_path / "out"))
-    again = job(room, tmp_path / "out")
-    clocks, solved = run(again)
-    assert again.steps.skipped == ["synchronize", "calibrate", "scale"]
-    assert clocks == first[0]
-    assert list(solved.cameras) == list(first[1].cameras)
-    for name, filmed in solved.cameras.items():
-        assert (filmed.camera.viewmat == first[1].cameras[name].camera.viewmat).all()
-    assert again.steps.summaries["scale"].startswith("arbitrary units; --distance")
-
-
 @pytest.mark.parametrize(
     ("options", "done"),
     [
@@ -107,9 +94,10 @@ def test_a_second_time_everything_is_there(room: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_change_does_what_depends_on_it(room: Path, tmp_path: Path, options: PrepareOptions, done: list[str]) -> None:
-    run(job(room, tmp_path / "out"))
+    before, _ = run(job(room, tmp_path / "out"))
     changed = job(room, tmp_path / "out", options)
-    _, solved = run(changed)
+    clocks, solved = run(changed)
+    assert clocks == before or "synchronize" in done
     assert [step for step in ("synchronize", "calibrate", "scale") if step not in changed.steps.skipped] == done
     assert solved.metres == (options.distance is not None)
 

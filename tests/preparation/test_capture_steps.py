@@ -11,12 +11,11 @@ import pytest
 
 from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import FOLDER, Silent, Steps
-from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method, held_out_of
+from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method
 from structgstream.preparation.solvers import given_cameras
 from tests.support.rooms import write_room
 
@@ -76,7 +75,6 @@ def test_who_is_held_out(tmp_path: Path) -> None:
     assert content.held_out == {"cam01", "cam03"}
     _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("auto",)))
     assert len(content.held_out) == 1
-    assert held_out_of(replace(NONE, held_out=()), None) == frozenset()  # pyright: ignore[reportArgumentType]
 
 
 def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
@@ -113,17 +111,17 @@ def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
 
 
 def test_another_mask_does_again_what_depends_on_it(tmp_path: Path) -> None:
-    _, steps, content = brought(tmp_path)
-    steps.points(content)
-    again, steps, content = brought(tmp_path)
-    steps.points(content)
+    one, content = brought(tmp_path)
+    one.points(content)
+    again, content = brought(tmp_path)
+    again.points(content)
     assert again.steps.skipped == ["points"]
     (tmp_path / "out" / "masks").mkdir()
     mask = np.full((120, 160), 255, np.uint8)
     mask[:60] = 0
     assert cv2.imwrite(str(tmp_path / "out" / "masks" / "cam00.png"), mask)
-    again, steps, content = brought(tmp_path)
-    steps.points(content)
+    again, content = brought(tmp_path)
+    again.points(content)
     assert again.steps.skipped == []
 
 
@@ -134,44 +132,43 @@ def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:
     assert "near" not in one.steps.summaries
 
 
-def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, Job, PreparedCapture]:
+def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, PreparedCapture]:
     footage, _, content = made(tmp_path / "videos", options)
     content = replace(content, cameras={n: replace(c, clock=Clock()) for n, c in content.cameras.items()})
     one = job(tmp_path / "videos", tmp_path / "out", options)
-    steps = one
     (tmp_path / "out").mkdir(exist_ok=True)
-    steps.link(footage, content)
-    return one, steps, content
+    one.link(footage, content)
+    return one, content
 
 
 def test_near_plane_and_points_are_kept(tmp_path: Path) -> None:
     options = replace(NONE, near=None)
-    one, steps, content = brought(tmp_path, options)
-    near = steps.near(content)
+    one, content = brought(tmp_path, options)
+    near = one.near(content)
     assert near.near > 0
-    pointed = steps.points(near)
+    pointed = one.points(near)
     points = np.load(tmp_path / "out" / POINTS)
     assert points.shape[1] == 3
     assert np.isfinite(points).all()
     assert one.steps.summaries["points"] == f"{len(points):,} points of frame 0"
     written = read_prepared(tmp_path / "out")
     assert (written.near, written.points) == (near.near, POINTS) == (pointed.near, pointed.points)
-    again, steps, content = brought(tmp_path, options)
-    assert prepared_entries(steps.points(steps.near(content))) == prepared_entries(pointed)
+    again, content = brought(tmp_path, options)
+    assert prepared_entries(again.points(again.near(content))) == prepared_entries(pointed)
     assert again.steps.skipped == ["near", "points"]
 
 
 def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None:
-    one, steps, content = brought(tmp_path)
-    content = steps.points(content)
-    findings = steps.check(content)
+    one, content = brought(tmp_path)
+    content = one.points(content)
+    findings = one.check(content)
     report = tmp_path / "out" / "report" / "index.html"
     assert report.is_file()
     kept = json.loads((tmp_path / "out" / FOLDER / "check.json").read_text())
     assert len(kept["values"]["findings"]) == len(findings)
     report.unlink()
-    again, steps, content = brought(tmp_path)
-    assert steps.check(steps.points(content)) == findings
+    again, content = brought(tmp_path)
+    assert again.check(again.points(content)) == findings
     assert again.steps.skipped == ["points"]
     assert report.is_file()
     count = f"{len(findings)} finding{'s' * (len(findings) != 1)}"
@@ -180,23 +177,18 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
 
 def test_an_interrupted_report_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where an earlier result fits, as its pictures are no longer those of the folder."""
-    _, steps, content = brought(tmp_path)
-    steps.check(steps.points(content))
+    one, content = brought(tmp_path)
+    one.check(one.points(content))
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    _, steps, content = brought(tmp_path)
-    content = steps.points(replace(content, near=0.5))
+    one, content = brought(tmp_path)
+    content = one.points(replace(content, near=0.5))
     with monkeypatch.context() as patched:
         patched.setattr("structgstream.preparation.prepare.write_report", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            steps.check(content)
-    again, steps, content = brought(tmp_path)
-    steps.check(steps.points(content))
+            one.check(content)
+    again, content = brought(tmp_path)
+    again.check(again.points(content))
     assert "check" not in again.steps.skipped
-
-
-def test_a_size_that_cannot_be(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        made(tmp_path / "videos", replace(NONE, field_of_view=181.0))

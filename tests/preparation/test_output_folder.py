@@ -12,7 +12,6 @@ import pytest
 from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.output_folder import (
     FOLDER,
-    LOCK,
     SOURCE,
     Link,
     Silent,
@@ -22,10 +21,10 @@ from structgstream.preparation.output_folder import (
     link,
     lock_output,
     mark_output,
-    remove_others,
     unlink,
 )
 from tests.support.killed import folders_of_the_killed
+from tests.support.quick_preparation import Heard
 
 
 @pytest.fixture
@@ -109,14 +108,6 @@ def test_one_at_a_time(tmp_path: Path, videos: Path) -> None:
         pass
 
 
-def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None:
-    mark_output(tmp_path / "capture", videos)
-    with pytest.raises(KeyError), lock_output(tmp_path / "capture"):
-        raise KeyError
-    with lock_output(tmp_path / "capture"):
-        assert (tmp_path / "capture" / FOLDER / LOCK).exists()
-
-
 def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
         lock_output(tmp_path / "capture").__enter__()
@@ -158,14 +149,6 @@ def test_a_link_that_cannot_be_made_is_a_copy(tmp_path: Path, monkeypatch: pytes
     assert (tmp_path / "b" / "a").read_text() == "film"
 
 
-def test_folders_come_file_by_file(tmp_path: Path) -> None:
-    (tmp_path / "cam").mkdir()
-    for number in range(3):
-        (tmp_path / "cam" / f"{number}.png").write_text(str(number))
-    link(tmp_path / "cam", tmp_path / "out" / "cam", how="hard")
-    assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
-
-
 @pytest.mark.parametrize("kind", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_a_copy_that_is_broken_off_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: BaseException
@@ -179,13 +162,6 @@ def test_a_copy_that_is_broken_off_leaves_nothing(
     with pytest.raises((StorageError, KeyboardInterrupt)):
         link(tmp_path / "a", tmp_path / "b" / "a", how="copy")
     assert not list((tmp_path / "b").iterdir())
-
-
-def test_what_was_brought_and_is_no_more_goes(tmp_path: Path) -> None:
-    for name in ("0.png", "1.png"):
-        (tmp_path / name).write_text("film")
-    remove_others(tmp_path, ["1.png"])
-    assert [file.name for file in tmp_path.iterdir()] == ["1.png"]
 
 
 @pytest.mark.parametrize("how", ["hard", "symlink", "copy"])
@@ -297,22 +273,6 @@ def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
     before = fingerprint(files)
     (tmp_path / "b" / "d" / "e").write_text("deeper")
     assert fingerprint(files) != before
-
-
-class Heard:
-    """A listener that records all calls."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[object, ...]] = []
-
-    def begin(self, step: str, *, skipped: bool) -> None:
-        self.calls.append(("begin", step, skipped))
-
-    def progress(self, done: int, total: int, what: str) -> None:
-        self.calls.append(("progress", done, total, what))
-
-    def end(self, step: str, summary: str) -> None:
-        self.calls.append(("end", step, summary))
 
 
 def test_steps_are_reported_and_their_summaries_recorded(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CalibrationError
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Job, Preparation, prepare_capture
@@ -81,16 +81,14 @@ def test_pictures_of_what_stands_still_need_no_clocks(tmp_path: Path) -> None:
     for name, pictures in matched_pictures(footage, clocks, PrepareOptions()).items():
         assert len(pictures) == 1
         assert np.abs(pictures[0].astype(int) - still[name]).max() <= 4
-    with pytest.raises(CaptureError, match="share no clock"):
-        first_clocks(footage, PrepareOptions(synchronize="stamps"))
 
 
 @pytest.mark.usefixtures("without_points", "without_check")
 def test_sound(tmp_path: Path) -> None:
     rig = write_room(tmp_path / "videos", cameras=4, frames=150)
     clocks = {name: Clock(0.31 * index) for index, name in enumerate(rig)}
-    for name, (samples, rate) in heard(clocks, seconds=5).items():
-        add_sound(tmp_path / "videos" / f"{name}.mp4", samples, rate)
+    for name, samples in heard(clocks, seconds=5).items():
+        add_sound(tmp_path / "videos" / f"{name}.mp4", samples)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out")
     found = read_prepared(tmp_path / "out")
     assert made.steps["synchronize"].startswith("audio: all cameras have sound")
@@ -145,6 +143,3 @@ def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
     with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
-    write_videos(tmp_path / "board", ["a", "b"], frames=2)
-    with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, board_videos=tmp_path / "board"))

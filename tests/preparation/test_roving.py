@@ -16,7 +16,7 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.data.roving import roving_of
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.errors import CaptureError
 from structgstream.evaluation.recording import capture_of
 from structgstream.preparation import prepare as preparation
 from structgstream.preparation import solvers
@@ -187,17 +187,3 @@ def test_a_roving_video_among_the_others_is_no_still_camera(tmp_path: Path, monk
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, roving=file))
     assert made.steps["link"].startswith("5 cameras")
     assert list(read_prepared(tmp_path / "out").cameras) == list(room_rig(5))
-
-
-def test_refining_would_leave_the_roving_frames_behind(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos")
-    options = replace(OPTIONS, refine=True, roving=write_walk(tmp_path / "walk"))
-    with pytest.raises(ConfigError, match="adjusts the still cameras alone"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
-
-
-def test_a_given_calibration_registers_no_roving_video(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos")
-    options = replace(OPTIONS, calibration="auto", roving=write_walk(tmp_path / "walk"))
-    with pytest.raises(ConfigError, match="registered by structure from motion alone"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)

@@ -15,12 +15,10 @@ from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
-    Clocks,
     board_footage,
     describe_focals,
     describe_turns,
     first_clocks,
-    matched_pictures,
     stated_focals,
     synchronized,
 )
@@ -96,26 +94,6 @@ def test_videos_without_a_moment_in_common(tmp_path: Path) -> None:
     table(footage, {"b": 9.0})
     with pytest.raises(CaptureError, match="no instant in common"):
         synchronized(footage, PrepareOptions())
-
-
-def test_pictures_are_of_the_same_moments(tmp_path: Path) -> None:
-    """Brightness says which frame it is."""
-    footage = filmed(tmp_path)
-    clocks = {name: Clock(index * 2 / 30) for index, name in enumerate(NAMES)}
-    shots = matched_pictures(footage, Clocks(clocks, "none", ""), PrepareOptions(instants=3))
-    seen = {name: [round((float(shot.mean()) - 20 - index) / 10) for shot in pictures_of(shots, name)]
-            for index, name in enumerate(NAMES)}  # fmt: skip
-    assert len(seen["a"]) == 3
-    assert [[a - b for a, b in zip(seen["a"], seen[name], strict=True)] for name in NAMES] == [
-        [0] * 3,
-        [2] * 3,
-        [4] * 3,
-    ]
-
-
-def pictures_of(shots: object, name: str) -> list[np.ndarray]:
-    found = shots[name]  # type: ignore[index]
-    return [np.asarray(one) for one in (found if isinstance(found, list) else list(found))]
 
 
 def test_the_board_is_filmed_by_all_in_the_same_mode(tmp_path: Path) -> None:

@@ -58,3 +58,10 @@ def shifted(camera: Camera, by: tuple[float, float, float]) -> Camera:
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] -= viewmat[:3, :3] @ torch.tensor(by, dtype=torch.float64)
     return replace(camera, viewmat=viewmat)
+
+
+def farther(camera: Camera, factor: float) -> Camera:
+    """The camera at so many times its distance from the origin, as in another unit."""
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] *= factor
+    return replace(camera, viewmat=viewmat)

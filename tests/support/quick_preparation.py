@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preparation without what takes most of its time, for tests that look at something else."""
+"""Preparation without what takes most of its time, for tests that look at something else, and who listens to it."""
 
 from functools import partial
 from pathlib import Path
@@ -24,3 +24,19 @@ def quicken(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _nothing_drawn(path: Path, *_: object, **__: object) -> None:
     path.touch()
+
+
+class Heard:
+    """A listener that records all calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[object, ...]] = []
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        self.calls.append(("begin", step, skipped))
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        self.calls.append(("progress", done, total, what))
+
+    def end(self, step: str, summary: str) -> None:
+        self.calls.append(("end", step, summary))

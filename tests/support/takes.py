@@ -15,6 +15,7 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.timeline import Clock
 from structgstream.frames import MultiViewFrame
 from structgstream.geometry import Floats
+from structgstream.opus import SAMPLE_RATE
 from tests.support.rigs import look_at
 
 WIDTH, HEIGHT = 160, 120
@@ -66,7 +67,7 @@ class MadeStreams:
     own_stamps: Mapping[str, Floats]
     views: Mapping[str, Camera] = field(default_factory=dict)
     clocks: Mapping[str, Clock] = field(default_factory=dict)
-    sounds: Mapping[str, tuple[NDArray[np.float32], float]] = field(default_factory=dict)
+    sounds: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     still: frozenset[str] = frozenset()
 
@@ -88,7 +89,7 @@ class MadeStreams:
             instant = 0.0 if name in self.still else clock.offset_seconds + clock.rate * stamp
             yield picture(self.views[name], instant, background, generator)
 
-    def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
+    def audio(self, name: str) -> NDArray[np.float32] | None:
         return self.sounds.get(name)
 
     def size(self, name: str) -> tuple[int, int]:
@@ -128,12 +129,11 @@ def heard(
     clocks: Mapping[str, Clock],
     *,
     seconds: float = 8.0,
-    rates: tuple[int, ...] = (48000,),
     snr_db: float = 15.0,
     echo: float = 0.03,
     delays: Mapping[str, float] | None = None,
     seed: int = 0,
-) -> dict[str, tuple[NDArray[np.float32], float]]:
+) -> dict[str, NDArray[np.float32]]:
     """What microphones record, by their own clocks, of claps and of noise that swells: with echoes, gains and noise
     of their own.
 
@@ -153,15 +153,14 @@ def heard(
         length = min(round(0.02 * SOUND_HERTZ), len(made) - first)
         made[first : first + length] += generator.normal(0, 3, length) * np.exp(-np.arange(length) / 400)
     recorded = {}
-    for index, (name, clock) in enumerate(clocks.items()):
+    for name, clock in clocks.items():
         tail = echo * generator.normal(size=round(0.4 * SOUND_HERTZ))
         tail *= np.exp(-np.arange(len(tail)) / (0.06 * SOUND_HERTZ))
         tail[: round(0.002 * SOUND_HERTZ)] = 0
         tail[0] = 1
         wave = oaconvolve(made, tail)[: len(made)]
-        rate = rates[index % len(rates)]
-        common = clock.offset_seconds + clock.rate * np.arange(round(seconds * rate)) / rate
+        common = clock.offset_seconds + clock.rate * np.arange(round(seconds * SAMPLE_RATE)) / SAMPLE_RATE
         samples = np.interp(common - (delays or {}).get(name, 0.0), times, wave) * generator.uniform(0.1, 1)
         samples += generator.normal(0, np.std(samples) * 10 ** (-snr_db / 20), len(samples))
-        recorded[name] = samples.astype(np.float32), float(rate)
+        recorded[name] = samples.astype(np.float32)
     return recorded

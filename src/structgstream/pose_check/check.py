@@ -294,9 +294,10 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     matcher = PairMatcher(frame.images, masks=frame.masks)
-    near = neighbor_errors(cameras, matcher)
-    check = _summed({pair: error for pair, error in near.items() if error is not None}, cameras)
-    if check.conclusive and not check.unmatched and not _contradicted(near, cameras):
+    near = {pair: error for pair, error in neighbor_errors(cameras, matcher).items() if error is not None}
+    check = _summed(near, cameras)
+    contradicted = find_suspects(near, cameras).bad or any(error.share > PAIR_SHARE for error in near.values())
+    if check.conclusive and not check.unmatched and not contradicted:
         return check
     evidence, verdict = examine_poses(frame, cameras, matcher=matcher)
     check = _summed(pair_errors(evidence, cameras), cameras)
@@ -317,13 +318,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     return check
 
 
-def _contradicted(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
-    """Whether a pair of neighbours contradicts the poses."""
-    found = {pair: error for pair, error in errors.items() if error is not None}
-    return bool(find_suspects(found, cameras).bad) or any(error.share > PAIR_SHARE for error in found.values())
-
-
-def _summed(errors: Mapping[tuple[str, str], PairError], cameras: Mapping[str, Camera]) -> PoseCheck:
+def _summed(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> PoseCheck:
     """The numbers of all pairs."""
     total = sum(error.matches for error in errors.values())
     violating = sum(error.matches * error.share for error in errors.values())

@@ -97,8 +97,8 @@ class Tracks:
     residuals: Floats  # ``[M]`` its distance to the projected point, pixels
 
     def of(self, name: str) -> NDArray[np.bool_]:
-        """Mask ``[M]`` of a camera's observations."""
-        return self.camera == self.names.index(name)
+        """Mask ``[M]`` of a camera's observations; it may have none."""
+        return self.camera == (self.names.index(name) if name in self.names else -1)
 
     @property
     def views(self) -> Indices:

@@ -106,7 +106,7 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
 
     ``tracks`` have the camera among those that are off, so that no point is made of its keypoints.
     """
-    own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
+    own = tracks.of(name)
     if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]

@@ -18,7 +18,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from structgstream.data.camera_files import (
     other_roots,
 )
 from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
-from structgstream.data.posed_capture import filmed_roots
+from structgstream.data.posed_capture import PICTURE_FPS, filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.sound import read_audio
 from structgstream.data.timeline import Clock, natural, picture_slots
@@ -42,11 +41,9 @@ from structgstream.data.video import measured_fps, pictures_at
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.errors import CaptureError
 from structgstream.geometry import Indices
-from structgstream.opus import SAMPLE_RATE
 
 _log = logging.getLogger(__name__)
 
-PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
 FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | UNREAD
 """What a camera may have written, also in ways that are not read here."""
@@ -78,10 +75,6 @@ class Footage:
     def fps(self) -> float:
         """Frames a second by time stamp; of pictures, what was stated."""
         return (measured_fps(self.tracks) if self.tracks else None) or self.picture_fps
-
-    def path(self, name: str) -> Path:
-        """The camera's video or folder, for messages."""
-        return self.files[name]
 
     def size(self, name: str) -> tuple[int, int]:
         """Width and height of a camera's pictures, pixels."""
@@ -134,12 +127,9 @@ class Footage:
                 assert shown is not None, "a lost picture raises"
                 yield shown[0]
 
-    def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
-        """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound."""
-        if name not in self.tracks:
-            return None
-        samples = read_audio(self.files[name])
-        return None if samples is None else (samples, float(SAMPLE_RATE))
+    def audio(self, name: str) -> NDArray[np.float32] | None:
+        """Mono samples ``[N]`` at ``SAMPLE_RATE``; sample 0 is at time 0 of the stamps. None without sound."""
+        return read_audio(self.files[name]) if name in self.tracks else None
 
     def metadata(self, name: str) -> dict[str, str]:
         """What a camera's file states as text, by lower-case key; nothing for pictures."""
@@ -291,13 +281,7 @@ class Shots(Sequence[Picture]):
     def __len__(self) -> int:
         return len(self.indices)
 
-    @overload
-    def __getitem__(self, number: int) -> Picture: ...
-    @overload
-    def __getitem__(self, number: slice) -> "Shots": ...
-    def __getitem__(self, number: int | slice) -> "Picture | Shots":
-        if isinstance(number, slice):
-            return Shots(self.footage, self.camera, self.indices[number])
+    def __getitem__(self, number: int) -> Picture:  # pyright: ignore[reportIncompatibleMethodOverride]  (no slices)
         return next(self.footage.pictures(self.camera, [self.indices[number]]))
 
 
@@ -314,8 +298,8 @@ def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float
     if first > last + 1e-6:
         lengths = [f"{spans[name][1] - spans[name][0]:.3f} s" for name in (early, late)]
         raise CaptureError(
-            f"The cameras of {footage.where} have no moment in common: {footage.path(early).name} of camera {early!r} "
-            f"ends {first - last:.3f} s before {footage.path(late).name} of camera {late!r} begins (lengths "
+            f"The cameras of {footage.where} have no moment in common: {footage.files[early].name} of camera {early!r} "
+            f"ends {first - last:.3f} s before {footage.files[late].name} of camera {late!r} begins (lengths "
             f"{lengths[0]} and {lengths[1]}); give longer videos, or leave one camera out with --without."
         )
     return first, last

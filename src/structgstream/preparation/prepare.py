@@ -107,13 +107,17 @@ class Job:
         self._check_names(options.without, footage, purpose="leave out")
         # A roving video that lies among the others is none of the still cameras'.
         walked = None if options.roving is None else options.roving.resolve()
-        still = [name for name in footage.cameras if footage.path(name).resolve() != walked]
+        still = [name for name in footage.cameras if footage.files[name].resolve() != walked]
         footage = footage.only([name for name in still if name not in options.without])
         self._check_names(held_out, footage, purpose="hold out")
         self._check_names(
             () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
         )
-        check_enough(footage)
+        if len(footage.cameras) < MIN_SOLVED:
+            raise CalibrationError(
+                f"{self.videos} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
+                "cameras cannot confirm each other's calibration: film with more."
+            )
         if len(footage.cameras) - len(set(held_out)) < MIN_CAMERAS:
             raise ConfigError(
                 f"{self.videos} has {len(footage.cameras)} cameras, {len(set(held_out))} of them held out; a "
@@ -228,7 +232,7 @@ class Job:
         for number, (name, camera) in enumerate(content.cameras.items()):
             self.steps.progress(number, len(content.cameras), name)
             target = self.capture / camera.files
-            source = footage.path(name)
+            source = footage.files[name]
             if not footage.tracks and source.is_file():
                 target = target / source.name
             link(source, target, how=self.options.link)
@@ -441,15 +445,6 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         )
 
 
-def check_enough(footage: Footage) -> None:
-    """Refuses too few cameras for poses that can be checked."""
-    if len(footage.cameras) < MIN_SOLVED:
-        raise CalibrationError(
-            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
-            "cameras cannot confirm each other's calibration: film with more."
-        )
-
-
 def _described(footage: Footage) -> str:
     sizes = sorted({footage.size(name) for name in footage.cameras})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
@@ -457,11 +452,6 @@ def _described(footage: Footage) -> str:
     frames = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
     kind = "videos" if footage.tracks else "folders of pictures"
     return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"
-
-
-def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
-    """The cameras to hold out."""
-    return frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
 
 
 def assembled(
@@ -478,10 +468,10 @@ def assembled(
     for name in footage.cameras:
         filmed = solved.cameras[name]
         pinhole = rectilinear(filmed, degrees=options.field_of_view, size=options.size)
-        where = f"videos/{name}{footage.path(name).suffix.lower()}" if footage.tracks else f"pictures/{name}"
+        where = f"videos/{name}{footage.files[name].suffix.lower()}" if footage.tracks else f"pictures/{name}"
         cameras[name] = PreparedCamera(where, filmed, pinhole, clocks.get(name, Clock()))
     rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
-    held_out = held_out_of(options, rig)
+    held_out = frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
     walked = {} if solved.roving is None else solved.roving.cameras
     roving = {name: PreparedCamera(f"{name}.png", filmed, rectilinear(filmed)) for name, filmed in walked.items()}

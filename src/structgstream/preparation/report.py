@@ -232,7 +232,7 @@ def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: s
     figure = figure_of(WIDTH_INCHES, 0.9 * WIDTH_INCHES * camera.height / camera.width + 0.4)
     axis = figure.subplots()
     _picture(axis, examined, name)
-    own = np.flatnonzero(tracks.of(name) & np.isfinite(tracks.residuals)) if name in tracks.names else np.empty(0, int)
+    own = np.flatnonzero(tracks.of(name) & np.isfinite(tracks.residuals))
     own = own[:: max(len(own) // MAX_POINTS, 1)]
     limit = 2 * examined.suspects.limit_pixels
     if len(own):
@@ -282,16 +282,16 @@ def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
     figure = figure_of(2 * WIDTH_INCHES * 0.8, 0.8 * WIDTH_INCHES * share + 0.6)
     left, right = figure.subplots(1, 2)
     lines = np.column_stack([pixels1, np.ones(len(pixels1))]) @ fundamental.T
+    lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     for axis, name in ((left, pair[0]), (right, pair[1])):
         _picture(axis, examined, name)
         axis.set_title(name, fontsize=10, color=INK, loc="left")
     for number, row in enumerate(chosen):
         color = COLORS[number % (len(COLORS) - 1)]
-        a, b, c = lines[row]
-        ends = _across(a, b, c, second.width, second.height)
-        if len(ends) == 2:
-            right.plot(*np.array(ends).T, color="white", linewidth=2.2)
-            right.plot(*np.array(ends).T, color=color, linewidth=1.2)
+        normal, distance = lines[row, :2], lines[row] @ [*pixels2[row], 1.0]
+        foot = pixels2[row] - distance * normal
+        for under, width in (("white", 2.2), (color, 1.2)):
+            right.axline(foot, foot + second.width * np.array([normal[1], -normal[0]]), color=under, linewidth=width)
         for axis, pixels in ((left, pixels1), (right, pixels2)):
             axis.plot(*pixels[row], "o", color=color, markeredgecolor="white", markeredgewidth=0.8, markersize=6)
     text = f"{error.matches} matches, median distance to their lines {error.pixels:.2f} pixels"
@@ -317,17 +317,6 @@ def _spread(pixels: np.ndarray, count: int) -> Sequence[int]:
         distances = np.minimum(distances, ((pixels - pixels[chosen[-1]]) ** 2).sum(1))
         chosen.append(int(distances.argmax()))
     return chosen
-
-
-def _across(a: float, b: float, c: float, width: int, height: int) -> list[tuple[float, float]]:
-    """Where the line ``ax + by + c = 0`` meets the border of a picture: two points, or none."""
-    ends = []
-    if abs(b) > 1e-12:
-        ends += [(x, -(a * x + c) / b) for x in (0.0, float(width))]
-    if abs(a) > 1e-12:
-        ends += [(-(b * y + c) / a, y) for y in (0.0, float(height))]
-    inside = [(x, y) for x, y in ends if -1e-6 <= x <= width + 1e-6 and -1e-6 <= y <= height + 1e-6]
-    return [min(inside), max(inside)] if len(inside) >= 2 else []
 
 
 STYLE = """

@@ -72,7 +72,6 @@ def synchronized(
         if chosen != "auto":
             raise
         raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
-    shared_seconds(footage, found.clocks)
     summary = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
     sure = found.method != "motion" or max(found.uncertainty_seconds.values()) <= SURE_PERIODS / footage.fps
     return Clocks(found.clocks, found.method, summary, sure)
@@ -181,7 +180,7 @@ def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
         size, other = found.size(name), footage.size(name)
         if size != other:
             raise CalibrationError(
-                f"Camera {name!r} filmed the board with {size[0]}x{size[1]} pixels ({found.path(name)}) and the take "
+                f"Camera {name!r} filmed the board with {size[0]}x{size[1]} pixels ({found.files[name]}) and the take "
                 f"with {other[0]}x{other[1]}; film both in one mode."
             )
     return found

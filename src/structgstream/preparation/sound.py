@@ -28,8 +28,6 @@ from structgstream.preparation.synchronization.audio import PairLag, UnusableSou
 log = logging.getLogger(__name__)
 
 LEVEL_SECONDS = 0.05
-BLOCKS = 1200
-"""Levels that are measured at once: those of a minute."""
 LOUD, QUIET = 95, 10
 """Percentiles of the level: how far what happens stands out from the noise is their difference."""
 CLIPPED_AT, CLIPPED_SHARE, CLIPPED_DECIBELS = 0.99, 1e-4, 20.0
@@ -48,11 +46,9 @@ def loudness(samples: NDArray[np.float32]) -> float | None:
     if count < 2 or not np.ptp(samples) > 0:
         return None
     blocks = samples[: count * length].reshape(count, length)
-    powers, clips = np.zeros(count), 0
-    for first in range(0, count, BLOCKS):  # two hours would take gigabytes at once
-        part = blocks[first : first + BLOCKS]
-        powers[first : first + BLOCKS] = np.mean(part.astype(np.float64) ** 2, axis=1)
-        clips += int(np.count_nonzero(np.abs(part) >= CLIPPED_AT))
+    # Without a copy of the samples, which of two hours takes gigabytes.
+    powers = np.einsum("bn,bn->b", blocks, blocks, dtype=np.float64) / length
+    clips = np.count_nonzero(blocks >= CLIPPED_AT) + np.count_nonzero(blocks <= -CLIPPED_AT)
     low, high = np.percentile(10 * np.log10(np.maximum(powers, 1e-10)), [QUIET, LOUD])
     clipped = clips / (count * length) > CLIPPED_SHARE
     return float(high - low) - CLIPPED_DECIBELS * clipped
@@ -174,7 +170,7 @@ def _clock_by_cameras(source: FrameSource, path: Path) -> Clock | None:
         if own is None or camera is None:
             continue
         try:
-            sounds = {name: sound_of(name, (own, SAMPLE_RATE)), FILE: sound_of(FILE, (samples, SAMPLE_RATE))}
+            sounds = {name: sound_of(name, own), FILE: sound_of(FILE, samples)}
         except UnusableSoundError:
             continue
         clocks += [_clock_of(lag, camera[1]) for lag in audio_lags(sounds) if lag.fine or not clocks]

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import re
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -82,24 +81,3 @@ def test_the_same_board_gives_the_same_bytes_and_the_board_as_text(tmp_path: Pat
 def test_a_board_that_does_not_fit_says_what_would(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not fit A4, which has room for 285 x 184 mm; take squares of 36 mm"):
         write_board_pdf(tmp_path / "board.pdf", Board(7, 5, 0.05))
-    with pytest.raises(ConfigError, match="'A9' is no paper size"):
-        page(tmp_path, BOARD, "A9")
-
-
-@pytest.mark.parametrize(
-    ("made", "message"),
-    [
-        (lambda: Board(2, 5), "2 x 5 squares"),
-        (lambda: Board(5, 5), "looks alike when turned"),
-        (lambda: Board(7, 5, -0.1), "positive size"),
-        (lambda: Board(7, 5, 0.1, 0.75, "5X5").opencv_board(), "'5X5' is no dictionary"),
-        (lambda: Board(20, 14, 0.1, 0.75, "DICT_4X4_50").opencv_board(), "needs 140 markers, DICT_4X4_50 has 50"),
-    ],
-)
-def test_impossible_boards_are_refused(made: Callable[[], object], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        made()
-
-
-def test_corners_are_those_of_opencv() -> None:
-    np.testing.assert_allclose(BOARD.corners, BOARD.opencv_board().getChessboardCorners(), atol=1e-7)

@@ -79,13 +79,6 @@ def test_a_rig_is_found_in_metres(model: LensModel) -> None:
     np.testing.assert_array_equal(found.cameras["cam00"].camera.viewmat, np.eye(4))
 
 
-def test_a_camera_that_never_sees_the_board_is_named() -> None:
-    _, pictures = filmed("pinhole")
-    blind = pictures | {"cam01": [np.full_like(shot, 90) for shot in pictures["cam01"]]}
-    with pytest.raises(CalibrationError, match=r"too rarely: by 'cam01' in 0 of 16 pictures, where 4 with"):
-        solve_board(blind, BOARD, lens="pinhole")
-
-
 def test_a_camera_that_sees_it_at_other_instants_only_is_named() -> None:
     _, pictures = filmed("pinhole")
     nothing = np.full_like(pictures["cam00"][0], 90)
@@ -127,9 +120,8 @@ def pose(instant: int) -> NDArray[np.float64]:
 POSES = {instant: pose(instant) for instant in (0, 1, 2, 4, 5, 6, 7)}
 
 
-def sightings(*, noise: float = 0.0) -> Sightings:
+def sightings() -> Sightings:
     """What all cameras see of all corners; the last one misses an instant."""
-    generator = np.random.default_rng(0)
     found: dict[str, list[Sighting]] = {}
     for name, filmed in RIG.items():
         for instant, board in POSES.items():
@@ -137,8 +129,7 @@ def sightings(*, noise: float = 0.0) -> Sightings:
                 continue
             pixels = filmed.pixels(BOARD.corners @ board[:3, :3].T + board[:3, 3])
             seen = np.flatnonzero(np.isfinite(pixels).all(1))
-            pixels = pixels[seen] + noise * generator.normal(size=(len(seen), 2))
-            found.setdefault(name, []).append(Sighting(instant, seen, pixels))
+            found.setdefault(name, []).append(Sighting(instant, seen, pixels[seen]))
     return found
 
 
@@ -151,13 +142,9 @@ def off(filmed: LensCamera) -> LensCamera:
     return LensCamera(replace(filmed.camera, viewmat=viewmat, K=K), RadialTangential())
 
 
-def adjusted(*, noise: float = 0.0) -> tuple[dict[str, LensCamera], dict]:
-    start = {name: off(filmed) for name, filmed in RIG.items()}
-    return adjust_board(BOARD, sightings(noise=noise), start, POSES, lens="radial")
-
-
 def test_without_noise_the_truth_is_found() -> None:
-    cameras, poses = adjusted()
+    start = {name: off(filmed) for name, filmed in RIG.items()}
+    cameras, poses = adjust_board(BOARD, sightings(), start, POSES, lens="radial")
     for error in calibration_errors(cameras, RIG).values():
         assert error.rotation_degrees < 1e-3
         assert error.position_percent < 1e-3
@@ -168,15 +155,3 @@ def test_without_noise_the_truth_is_found() -> None:
     assert list(poses) == list(POSES)
     for instant, found in poses.items():
         np.testing.assert_allclose(found, FIRST @ POSES[instant], atol=1e-5)
-
-
-def test_the_first_camera_is_the_world_exactly() -> None:
-    cameras, _ = adjusted(noise=0.3)
-    assert (cameras["cam00"].camera.viewmat == torch.eye(4, dtype=torch.float64)).all()
-
-
-def test_noise_makes_small_errors() -> None:
-    cameras, _ = adjusted(noise=0.3)
-    for error in calibration_errors(cameras, RIG).values():
-        assert error.rotation_degrees < 0.2
-        assert error.position_percent < 1.0

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from concurrent.futures import CancelledError
 from dataclasses import replace
-from threading import Event
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from structgstream.preparation.calibration.keypoints import (
     Keypoints,
     all_keypoints,
     all_matches,
-    camera_keypoints,
     guided_matches,
     keypoint_matches,
     spread_order,
@@ -29,13 +26,17 @@ def scene(shift: int) -> np.ndarray:
     return picture
 
 
+def of_camera(pictures: list[np.ndarray]) -> Keypoints:
+    return all_keypoints({"one": pictures}, workers=1)["one"]
+
+
 def test_what_stands_still_is_kept_once_and_what_moves_adds() -> None:
     pictures = [scene(0), scene(0), scene(60)]
-    alone = camera_keypoints(pictures[:1])
-    still = camera_keypoints(pictures[:2])
+    alone = of_camera(pictures[:1])
+    still = of_camera(pictures[:2])
     assert len(still) == len(alone)
     assert still.seen.all()
-    moved = camera_keypoints(pictures)
+    moved = of_camera(pictures)
     assert len(alone) + 20 < len(moved) < 2 * len(alone)
     beyond = moved.pixels[:, 1] > 160  # rows that the patch never covers
     assert moved.seen[beyond].mean() > 0.9
@@ -47,14 +48,14 @@ def test_what_stands_still_is_kept_once_and_what_moves_adds() -> None:
 def test_reduced_pictures_give_pixels_of_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keypoints, "LONGEST_SIDE", 100)
     large = np.repeat(np.repeat(scene(0)[:100, :100], 4, 0), 4, 1)
-    found = camera_keypoints([large]).pixels
-    small = camera_keypoints([scene(0)[:100, :100]]).pixels
+    found = of_camera([large]).pixels
+    small = of_camera([scene(0)[:100, :100]]).pixels
     assert len(found) == len(small)
     np.testing.assert_allclose(found, 4 * small, atol=0.1)
 
 
 def test_bare_pictures_give_none() -> None:
-    assert len(camera_keypoints([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
+    assert len(of_camera([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
 
 
 def test_further_instants_are_looked_at_where_the_first_give_little(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,13 +75,6 @@ def test_every_beginning_of_the_order_is_spread() -> None:
     assert spread_order(1) == [0]
     assert spread_order(9)[:3] == [0, 8, 4]
     assert sorted(spread_order(9)) == list(range(9))
-
-
-def test_what_was_interrupted_looks_at_no_further_picture() -> None:
-    stopping = Event()
-    stopping.set()
-    with pytest.raises(CancelledError):
-        camera_keypoints([scene(0)], stopping=stopping)
 
 
 def test_an_interruption_is_heard_between_two_pictures() -> None:

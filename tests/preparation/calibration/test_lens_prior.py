@@ -20,7 +20,6 @@ def test_an_offset_that_all_share_costs_less_than_as_large_ones_of_their_own() -
     alike[:, ACROSS] = 0.01
     each[:, ACROSS] = 0.01 * (-1.0) ** np.arange(LENSES)
     assert prior.cost(alike) < 0.01 * prior.cost(each)
-    assert prior.shared(alike)[0, 0] == pytest.approx(0.01, rel=0.01)
 
 
 def test_how_far_lenses_differ_is_estimated() -> None:
@@ -43,9 +42,3 @@ def test_the_cost_has_the_gradient_and_the_curvature_that_are_added() -> None:
     step[:, ACROSS] = np.random.default_rng(1).normal(size=LENSES) * 1e-3
     flat = step[:, list(FREE)].ravel()
     assert prior.cost(own + step) - prior.cost(own) == pytest.approx(gradient @ flat + flat @ A @ flat / 2)
-
-
-def test_terms_without_a_prior_cost_nothing() -> None:
-    prior = usual_prior(np.zeros(LENSES, np.intp), (FOCAL,), fisheye=False)
-    assert prior.terms == ()
-    assert prior.cost(rows(0.3, 0.1)) == 0

@@ -1,24 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""COLMAP's mappers and its adjustment on matches that are made, whose cameras are known."""
+"""COLMAP's mappers, its adjustment and its points on matches that are made, whose cameras are known."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from structgstream.data.lenses import LensCamera
+from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.mapping import (
     Mapper,
     PosedGraph,
     adjust,
     cameras_of,
-    filtered,
     mapped,
+    observed,
     posed_model,
     size_of,
     verified_pairs,
+    without,
     write_database,
 )
 from tests.support.calibration_errors import calibration_errors
@@ -67,10 +69,31 @@ def test_adjusting_finds_focal_lengths() -> None:
     assert all(float(camera.camera.K[0, 0]) == pytest.approx(420, abs=2) for camera in cameras_of(free).values())
 
 
-def test_filtering_removes_what_is_far_off_or_seen_from_one_side() -> None:
-    graph = graph_of(RIG)
-    model = posed_model(graph, RIG, pixels=4.0, slack_degrees=1.0)
-    assert filtered(model, pixels=2.0, degrees=1.5) == 0
-    count = len(model.point3D_ids())
-    assert filtered(model, pixels=2.0, degrees=89.0) > 0
-    assert len(model.point3D_ids()) < count
+BENT = ring(4, radius=2.6, arc_degrees=50, lens=RadialTangential(k1=-0.1))
+
+
+def points_of(found: PosedGraph) -> tuple[np.ndarray, np.ndarray]:
+    """Places and numbers of the points that the model has."""
+    model = posed_model(found, BENT, pixels=1.0, slack_degrees=0.4)
+    points, seen = observed(model, found.keypoints, BENT)
+    which = np.array([
+        np.linalg.norm(BENT["cam00"].pixels(cloud()) - BENT["cam00"].pixels(point), axis=1).argmin() for point in points
+    ])  # fmt: skip
+    assert len(seen) > 2 * len(points)
+    return points, which
+
+
+def test_points_lie_where_they_were_and_poses_stay() -> None:
+    points, which = points_of(graph_of(BENT, noise=0.0))
+    assert len(set(which)) == len(points) > 100
+    np.testing.assert_allclose(points, cloud()[which], atol=1e-4)  # keypoints are stored as float32
+
+
+def test_matches_that_are_dropped_make_no_points() -> None:
+    """Without the matches of the first 60 points there are no such points; the graph itself is unchanged."""
+    graph = graph_of(BENT, noise=0.0)
+    before = {pair: len(rows) for pair, rows in graph.matches.items()}
+    fewer = without(graph, {pair: rows[:, 0] < 60 for pair, rows in graph.matches.items()})
+    _, which = points_of(fewer)
+    assert which.min() >= 60
+    assert {pair: len(found.inlier_matches) for pair, found in graph.geometries.items()} == before

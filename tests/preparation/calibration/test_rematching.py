@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from structgstream.preparation.calibration import mapping
-from structgstream.preparation.calibration.bundle import Limits, adjust_together
+from structgstream.preparation.calibration.bundle import adjust_together
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import rematched
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from tests.support.calibration_errors import calibration_errors
 from tests.support.repetitive import keypoints_of, points, ring
 
-LIMITS = Limits(2.0, 1.5)
+PIXELS = 2.0
 FEW = 40
 COUNT = 6
 ADJUST = partial(
     adjust_together,
     lens=range(COUNT),
     free=(FOCAL, ASPECT, ACROSS, DOWN),
-    limits=LIMITS,
+    pixels=PIXELS,
 )
 
 
@@ -42,7 +42,7 @@ def largest(found: SolvedCalibration) -> float:
 def test_more_points_than_stood_out_at_first_make_cameras_more_exact() -> None:
     first = first_solution()
     keypoints = keypoints_of(ring(COUNT))
-    again = rematched(first, keypoints, limits=LIMITS, adjust=ADJUST, workers=1)
+    again = rematched(first, keypoints, pixels=PIXELS, adjust=ADJUST, workers=1)
     assert len(again.observations) > 5 * len(first.observations)
     assert largest(again) < 0.6 * largest(first)
     rows = np.column_stack([again.observations.camera, again.observations.pixels])
@@ -52,14 +52,14 @@ def test_more_points_than_stood_out_at_first_make_cameras_more_exact() -> None:
 def test_a_solution_with_enough_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapping, "ENOUGH", FEW // 2)
     first = first_solution()
-    assert rematched(first, {}, limits=LIMITS, adjust=ADJUST, workers=1) is first
+    assert rematched(first, {}, pixels=PIXELS, adjust=ADJUST, workers=1) is first
 
 
 def test_a_solution_stays_if_little_is_gained_or_a_camera_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     first, keypoints = first_solution(), keypoints_of(ring(COUNT))
     with monkeypatch.context() as patched:
         patched.setattr(mapping, "MIN_GAIN", 100.0)
-        assert rematched(first, keypoints, limits=LIMITS, adjust=ADJUST, workers=1) is first
+        assert rematched(first, keypoints, pixels=PIXELS, adjust=ADJUST, workers=1) is first
 
     def losing(found: SolvedCalibration) -> SolvedCalibration:
         seen = found.observations
@@ -67,4 +67,4 @@ def test_a_solution_stays_if_little_is_gained_or_a_camera_loses(monkeypatch: pyt
         parts = (seen.point[kept], seen.camera[kept], seen.pixels[kept], seen.instant[kept])
         return replace(found, observations=Observations(*parts))
 
-    assert rematched(first, keypoints, limits=LIMITS, adjust=losing, workers=1) is first
+    assert rematched(first, keypoints, pixels=PIXELS, adjust=losing, workers=1) is first

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.data.matching import connected_groups
-from structgstream.preparation.calibration.colmap import colmap_camera, pycolmap_module
-from structgstream.preparation.calibration.mapping import verified_pairs, write_database
+from structgstream.preparation.calibration.colmap import colmap_camera
+from structgstream.preparation.calibration.mapping import verified_pairs
 from tests.support.filmed import ring
 from tests.support.properties import examples
 from tests.support.views_made import cloud, keypoints_of, matches_of
@@ -55,32 +53,6 @@ def test_pairs_that_agree_by_chance_or_in_a_few_points_do_not_pass() -> None:
         workers=1,
     )
     assert set(found) == {("cam01", "cam02")}
-
-
-def test_the_database_holds_what_was_written(tmp_path: Path) -> None:
-    """Two cameras share their intrinsics, the third has its own, and its keypoints in another order."""
-    points = cloud()
-    keypoints, matches = keypoints_of(RIG, points), matches_of(RIG, points)
-    order = np.random.default_rng(0).permutation(len(points))
-    keypoints["cam02"] = replace(keypoints["cam02"], pixels=keypoints["cam02"].pixels[order])
-    for pair in (("cam00", "cam02"), ("cam01", "cam02")):
-        matches[pair][:, 1] = np.argsort(order)[matches[pair][:, 1]]
-    numbers = dict(zip(RIG, (1, 1, 2), strict=True))
-    cameras = {name: colmap_camera(filmed, numbers[name]) for name, filmed in RIG.items()}
-    geometries = verified_pairs(keypoints, matches, cameras, workers=1)
-    ids = write_database(tmp_path / "database.db", keypoints, cameras, geometries)
-    assert sorted(ids) == sorted(RIG)
-    with pycolmap_module().Database.open(tmp_path / "database.db") as database:
-        images = {image.name: image for image in database.read_all_images()}
-        assert {name: images[name].image_id for name in RIG} == ids
-        assert {name: images[name].camera_id for name in RIG} == numbers
-        assert database.num_cameras() == 2
-        for name in RIG:
-            np.testing.assert_allclose(database.read_keypoints(ids[name])[:, :2], keypoints[name].pixels, atol=1e-4)
-        for one, two in geometries:
-            stored = database.read_matches(ids[one], ids[two])
-            np.testing.assert_array_equal(stored, geometries[one, two].inlier_matches)
-            assert len(database.read_two_view_geometry(ids[one], ids[two]).inlier_matches) == len(stored)
 
 
 @examples(60)

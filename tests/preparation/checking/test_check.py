@@ -7,18 +7,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import Finding, explain
 from structgstream.pose_check.tracks import gather
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, CheckReport, check_capture
+from tests.support.evidence_made import Cameras, farther, turned
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import room_frame, room_rig
-
-Cameras = dict[str, Camera]
 
 
 @cache
@@ -43,20 +41,6 @@ def errors_of(report: CheckReport) -> list[Finding]:
 
 def errors(check: Checked) -> list[str]:
     return [finding.sentence for finding in errors_of(check.report)]
-
-
-def turned(camera: Camera, degrees: float) -> Camera:
-    angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[0, 0] = turn[2, 2] = angle.cos()
-    turn[0, 2], turn[2, 0] = angle.sin(), -angle.sin()
-    return replace(camera, viewmat=turn @ camera.viewmat)
-
-
-def moved(camera: Camera, factor: float) -> Camera:
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] *= factor
-    return replace(camera, viewmat=viewmat)
 
 
 def test_a_good_rig_is_fine() -> None:
@@ -106,7 +90,7 @@ def test_points_of_another_unit_are_reported() -> None:
 
 def test_points_that_were_estimated_with_a_camera_of_another_unit_are_not_reported_beside_it() -> None:
     def mistake(cameras: Cameras) -> None:
-        cameras["cam03"] = moved(cameras["cam03"], 1000.0)
+        cameras["cam03"] = farther(cameras["cam03"], 1000.0)
 
     points = 1000 * np.random.default_rng(0).uniform([-0.5, -0.4, 0.3], [0.5, 0.6, 1.5], (200, 3))
     (found,) = errors_of(checked(mistake, points=points).report)

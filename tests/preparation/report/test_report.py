@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What charts show, read from the figures; that they are written is tried in ``test_write``."""
+"""The page, and what charts show, read from the figures."""
 
 import json
 import re

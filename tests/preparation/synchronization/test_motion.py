@@ -16,7 +16,7 @@ import pytest
 
 from structgstream.cameras import Camera
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
-from structgstream.data.matching import epipolar_errors, fundamental_matrix
+from structgstream.data.matching import epipolar_errors
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal
@@ -90,7 +90,7 @@ def test_a_camera_of_another_take_is_left_out() -> None:
 
 
 def test_two_seconds_of_activity_without_geometry_are_refused_or_right() -> None:
-    pairs = pair_signals(changes(), None)
+    pairs = pair_signals(changes(), CalibratedGeometry({}))
     assert not any(pair.epipolar for pair in pairs)
     group, solution, _ = agreeing_cameras(takes(), pairs, slack_seconds=1 / 60)
     if solution is not None:
@@ -183,7 +183,7 @@ def test_one_picture_has_no_changes() -> None:
     assert not changes.moving
 
 
-CAMERAS = lenses(ring(3))
+CAMERAS = {name: LensCamera(camera, RadialTangential(k1=-0.1, p1=0.01)) for name, camera in ring(3).items()}
 
 
 def spots(name: str, points: np.ndarray) -> Changes:
@@ -218,26 +218,6 @@ def test_views_that_share_few_lines_have_no_signals() -> None:
     assert line_signals(*views, geometry) is None
 
 
-POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
-
-
-def worst(geometry: CalibratedGeometry, cameras: Mapping[str, LensCamera]) -> float:
-    """Largest distance of points from their lines, in normalised coordinates."""
-    pair = geometry.pair("cam0", "cam1")
-    assert pair is not None
-    first, second = (
-        straight(cameras[name].pixels(POINTS)) for name, straight in zip(("cam0", "cam1"), pair.straighten)
-    )
-    return float(epipolar_errors(pair.F, first, second).max())
-
-
-def test_points_lie_on_their_lines() -> None:
-    cameras = lenses(ring(2))
-    assert worst(CalibratedGeometry(cameras), cameras) < 1e-9
-    bent = {name: LensCamera(own.camera, RadialTangential(k1=-0.1, p1=0.01)) for name, own in cameras.items()}
-    assert worst(CalibratedGeometry(bent), bent) < 1e-6
-
-
 def test_cameras_without_calibration_or_at_one_place_have_no_geometry() -> None:
     cameras = lenses(ring(2))
     assert CalibratedGeometry(cameras).pair("cam0", "other") is None
@@ -267,9 +247,9 @@ def test_static_features_give_the_geometry() -> None:
     pair = geometry.pair("cam0", "cam1")
     assert pair is not None
     assert pair.estimated
-    first, second = (LensCamera(camera, Pinhole()).pixels(POINTS) for camera in cameras.values())
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    first, second = (LensCamera(camera, Pinhole()).pixels(points) for camera in cameras.values())
     assert np.median(epipolar_errors(pair.F, first, second)) < 2
-    assert np.median(epipolar_errors(fundamental_matrix(*cameras.values()), first, second)) < 1e-6
 
 
 def test_views_without_texture_have_no_geometry() -> None:

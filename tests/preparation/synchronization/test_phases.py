@@ -6,38 +6,37 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.synchronization.audio import (
     GRID_HERTZ,
     OTHER_SECONDS,
     REACH_SECONDS,
-    Recording,
     Window,
     ambiguity_seconds,
     phase_window,
 )
 from tests.support.properties import examples
 
-RATE, LONG = 48_000, 6.0
+LONG = 6.0
 REACH = round(REACH_SECONDS * GRID_HERTZ)
 
 
 def noise(seed: int = 0, seconds: float = LONG) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=round(seconds * RATE)).astype(np.float32)
+    return np.random.default_rng(seed).normal(size=round(seconds * SAMPLE_RATE)).astype(np.float32)
 
 
-def heard(lag: float, *, gain: float = 1.0, snr: float = 3.0, rate: float = RATE) -> tuple[Recording, Recording]:
-    """A sound, and the same one later by ``lag`` seconds with noise of its own, at another gain and rate."""
+def heard(lag: float, *, gain: float = 1.0, snr: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+    """A sound, and the same one later by ``lag`` seconds with noise of its own, at another gain."""
     sound = noise()
-    times = np.arange(round(LONG * rate)) / rate - lag
-    late = np.interp(times, np.arange(len(sound)) / RATE, sound)
+    times = np.arange(len(sound)) / SAMPLE_RATE
+    late = np.interp(times - lag, times, sound)
     late += np.random.default_rng(9).normal(size=len(times)) / snr
-    return Recording(sound, RATE), Recording((gain * late).astype(np.float32), rate)
+    return sound, (gain * late).astype(np.float32)
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.0031, -0.5, 1.2345678])
-@pytest.mark.parametrize("rate", [48_000.0, 44_100.0])
-def test_the_lag_is_found_within_a_sample_of_neither(lag: float, rate: float) -> None:
-    found = phase_window(*heard(lag, gain=0.02, rate=rate), 3.0, lag + 0.002)
+def test_the_lag_is_found_within_a_part_of_a_sample(lag: float) -> None:
+    found = phase_window(*heard(lag, gain=0.02), 3.0, lag + 0.002)
     assert found is not None
     assert found.seconds == pytest.approx(lag, abs=3e-6)
     assert found.middle == 3.0
@@ -52,12 +51,12 @@ def test_the_expectation_does_not_move_the_answer() -> None:
 def test_beyond_its_reach_nothing_stands_out() -> None:
     assert phase_window(*heard(0.25), 3.0, 0.25 + 2 * REACH_SECONDS) is None
     one, _ = heard(0.0)
-    assert phase_window(one, Recording(noise(5), RATE), 3.0, 0.0) is None
+    assert phase_window(one, noise(5), 3.0, 0.0) is None
 
 
 def test_silence_and_the_ends_of_a_recording_tell_nothing() -> None:
     one, other = heard(0.0)
-    assert phase_window(one, Recording(np.zeros_like(other.samples), RATE), 3.0, 0.0) is None
+    assert phase_window(one, np.zeros_like(other), 3.0, 0.0) is None
     assert phase_window(one, other, 3.0, 0.0) is not None
     assert phase_window(one, other, 0.5, 0.0) is not None  # three quarters of the window are there
     for middle in (-0.3, LONG + 0.3, 50.0):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.atomic_files import atomic_write
 from structgstream.data.images import opencv
-from structgstream.errors import CalibrationError, ConfigError, MissingExtraError
+from structgstream.errors import CalibrationError, ConfigError, import_extra
 from structgstream.geometry import Floats, Indices
 
 
@@ -259,12 +259,11 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
         StorageError: the file cannot be written.
     """
     width, height = board_page(board, paper)
-    try:
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Rectangle as Patch
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
+    import_extra("matplotlib", "report")
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle as Patch
+
     figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
     for left, bottom, across, down in (*board_rectangles(board, paper), *_bar()):
         corner = left / width, bottom / height
@@ -280,8 +279,6 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
 
 def board_page(board: Board, paper: Paper) -> tuple[float, float]:
     """Width and height of the page in mm, lying."""
-    if paper not in PAPERS_MM:
-        raise ConfigError(f"{paper!r} is no paper size; expected one of {', '.join(PAPERS_MM)}.")
     width, height = PAPERS_MM[paper]
     across, down = (1000 * side for side in board.size_metres)
     room = width - 2 * MARGIN_MM, height - 2 * MARGIN_MM - FOOT_MM

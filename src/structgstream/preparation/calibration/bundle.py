@@ -6,7 +6,6 @@ from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a mode
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_terms.py``)."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -228,24 +227,16 @@ def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floa
     )
 
 
-_log = logging.getLogger(__name__)
-
-MAX_PIXELS = 3.0
+MAX_PIXELS, MIN_DEGREES = 3.0, 1.5
+"""Largest reprojection error, in pictures of 1000 pixels, and smallest angle between a point's rays."""
 ROUNDS, STEPS, SAME = 8, 2, 0.05
 NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Which observations stay."""
-
-    pixels: float  # largest reprojection error
-    degrees: float = 1.5  # smallest angle between the rays of a point
-
-    @classmethod
-    def for_pictures(cls, longest_side: int) -> "Limits":
-        """Three pixels of pictures of 1000 pixels on the longer side, in proportion, and never under one."""
-        return cls(max(1.0, MAX_PIXELS * longest_side / 1000))
+def inlier_pixels(longest_side: int) -> float:
+    """Largest reprojection error of what stays, pixels: three of pictures of 1000 pixels on the longer side, in
+    proportion, and never under one."""
+    return max(1.0, MAX_PIXELS * longest_side / 1000)
 
 
 def adjust_together(
@@ -253,32 +244,32 @@ def adjust_together(
     *,
     lens: Sequence[int],
     free: Sequence[int],
-    limits: Limits,
+    pixels: float,
     makes: Sequence[int] | None = None,
 ) -> SolvedCalibration:
     """``found`` with poses, points and the free terms (``lens_terms.py``) of its lenses adjusted, without the
-    observations that are off. ``lens`` has the number of the lens of each camera; cameras with shared intrinsics have
-    one. Lenses of one picture size share a mean; where ``makes`` has a number for each camera, those of one number."""
+    observations that are more than ``pixels`` off. ``lens`` has the number of the lens of each camera; cameras with
+    shared intrinsics have one. Lenses of one picture size share a mean; where ``makes`` has a number for each camera,
+    those of one number."""
     bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), makes)
     bundle, parameters = estimated(bundle, parameters)
     adjusted = replace(
         found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions
     )
-    inliers = cleaned(adjusted, limits)
-    _log_adjustment(adjusted, inliers, bundle)
+    inliers = cleaned(adjusted, pixels=pixels)
     again, parameters = _problem(inliers, bundle.lens, bundle.free, makes)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
     parameters = solved(again, parameters)
     cameras = cameras_in(parameters, inliers.cameras, again.lens)
-    return cleaned(replace(inliers, cameras=cameras, points=parameters.body_positions), limits)
+    return cleaned(replace(inliers, cameras=cameras, points=parameters.body_positions), pixels=pixels)
 
 
-def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
-    """Without observations that are too far off, and without points whose rays then have too small an angle."""
+def cleaned(found: SolvedCalibration, *, pixels: float) -> SolvedCalibration:
+    """Without observations that are further off, and without points whose rays then have too small an angle."""
     seen = found.observations
     with np.errstate(invalid="ignore"):
-        good = found.errors() <= limits.pixels
-    wide = _angles(found, good) >= np.radians(limits.degrees)
+        good = found.errors() <= pixels
+    wide = _angles(found, good) >= np.radians(MIN_DEGREES)
     return chosen(found, good & wide[seen.point])
 
 
@@ -328,7 +319,7 @@ def estimated(bundle: Bundle, parameters: Parameters) -> tuple[Bundle, Parameter
     """Adjusted, with the noise and the differences of lenses that fit best."""
     poses = bundle.columns[0]
     bundle = _with_noise(bundle, parameters)
-    for _ in range(ROUNDS if bundle.free else 1):
+    for _ in range(ROUNDS):
         parameters = solved(bundle, parameters, max_steps=STEPS)
         covariance = linearized(bundle, parameters).covariance()
         prior = bundle.prior.updated(parameters.rows, covariance, start=poses, free=bundle.free)
@@ -371,14 +362,3 @@ def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
         angle = np.arctan2(sine, (rays[step:] * rays[:-step]).sum(1))
         np.maximum.at(widest, points[step:][same], angle[same])
     return widest
-
-
-def _log_adjustment(before: SolvedCalibration, after: SolvedCalibration, bundle: Bundle) -> None:
-    counts = [np.bincount(own.observations.camera, minlength=len(own.cameras)) for own in (before, after)]
-    lost = {name: int(count) for name, count in zip(before.cameras, counts[0] - counts[1], strict=True) if count}
-    _log.info(
-        "Adjusted: noise %.2f pixels, %d of %d observations removed (%s), lenses of a group differ by %s.",
-        bundle.noise, int(sum(lost.values())), len(before.observations),
-        ", ".join(f"{name} {count}" for name, count in lost.items()) or "none",
-        dict(zip(bundle.prior.terms, bundle.prior.differences.round(5).T.tolist(), strict=True)),
-    )  # fmt: skip

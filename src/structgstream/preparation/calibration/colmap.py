@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.errors import MissingExtraError
+from structgstream.errors import import_extra
 from structgstream.preparation.calibration.lens_terms import LensModel
 
 MODELS: dict[LensModel, str] = {
@@ -32,10 +32,7 @@ QUIET = 3  # COLMAP logs every step and every failed start; results are reported
 
 def pycolmap_module() -> ModuleType:
     """The module ``pycolmap``, from the extra ``sfm``, with its log level lowered."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise MissingExtraError("pycolmap", "sfm") from None
+    pycolmap = import_extra("pycolmap", "sfm")
     pycolmap.logging.minloglevel = QUIET
     return pycolmap
 

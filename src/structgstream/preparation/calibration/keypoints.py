@@ -45,34 +45,6 @@ class Keypoints(Features):
         return len(self.pixels)
 
 
-def camera_keypoints(
-    pictures: Sequence[NDArray[np.uint8]],
-    *,
-    instants: Sequence[int] | None = None,
-    known: Keypoints | None = None,
-    stopping: Event | None = None,
-) -> Keypoints:
-    """Covariant SIFT keypoints with domain-size pooling of a still camera's ``pictures [H, W, 3]``, one an instant,
-    merged.
-
-    Affine shapes and pooled descriptors (Mikolajczyk and Schmid, IJCV 2004; Dong and Soatto, CVPR 2015) match over
-    wider baselines than plain SIFT.
-
-    Args:
-        instants: which of the pictures are looked at; all by default.
-        known: keypoints of the others that were looked at.
-        stopping: when it is set, no further picture is looked at, and ``CancelledError`` is raised.
-    """
-    extractor = _extractor()
-    count = len(pictures)
-    found = known or Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32), np.zeros((0, count), bool))
-    for instant in range(count) if instants is None else instants:
-        if stopping is not None and stopping.is_set():
-            raise CancelledError
-        found = _merged(found, instant, *_extracted(extractor, pictures[instant]))
-    return found
-
-
 def _merged(known: Keypoints, instant: int, pixels: Floats, descriptors: NDArray[np.float32]) -> Keypoints:
     """``known`` and the keypoints of one more instant; those that repeat known ones count once."""
     which = _repeated(known, pixels, descriptors)
@@ -89,9 +61,11 @@ def _merged(known: Keypoints, instant: int, pixels: Floats, descriptors: NDArray
 
 
 def all_keypoints(pictures: Mapping[str, Sequence[NDArray[np.uint8]]], *, workers: int) -> dict[str, Keypoints]:
-    """:func:`camera_keypoints` of every camera, from as many instants as give enough.
+    """Covariant SIFT keypoints with domain-size pooling of still cameras' pictures ``[H, W, 3]``, one an instant; those
+    of a camera are merged. From as many instants as give enough; an interruption is noticed between two pictures.
 
-    An interruption is noticed between two pictures.
+    Affine shapes and pooled descriptors (Mikolajczyk and Schmid, IJCV 2004; Dong and Soatto, CVPR 2015) match over
+    wider baselines than plain SIFT.
     """
     order = spread_order(min(map(len, pictures.values()), default=0))
     found: dict[str, Keypoints] = {}
@@ -112,7 +86,13 @@ def _with_instants(
     stopping = Event()
 
     def one(name: str) -> Keypoints:
-        return camera_keypoints(pictures[name], instants=instants, known=known.get(name), stopping=stopping)
+        extractor, seen = _extractor(), np.zeros((0, len(pictures[name])), bool)
+        found = known.get(name) or Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32), seen)
+        for instant in instants:
+            if stopping.is_set():
+                raise CancelledError
+            found = _merged(found, instant, *_extracted(extractor, pictures[name][instant]))
+        return found
 
     with ThreadPoolExecutor(workers) as pool:
         try:

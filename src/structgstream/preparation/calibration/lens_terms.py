@@ -197,14 +197,6 @@ class LensPrior:
             A[np.ix_(where, where)] += precision
             gradient[where] += precision @ rows[lenses, term]
 
-    def shared(self, rows: Floats) -> Floats:
-        """The estimated means ``[G, T]``."""
-        found = np.zeros_like(self.differences)
-        for group, column in np.ndindex(found.shape):
-            own = rows[self.group == group, self.terms[column]]
-            found[group, column] = self._pull(group, column) * own.sum()
-        return found
-
     def updated(self, rows: Floats, covariance: Floats, *, start: int, free: Sequence[int]) -> "LensPrior":
         """With the deviations that rows and their covariance, in the order of :meth:`add`, make most likely."""
         differences, means = self.differences.copy(), self.means.copy()

@@ -8,7 +8,6 @@ walls, at one depth, where a camera's place can be exchanged for its focal lengt
 near the epipolar lines of the first solution are more, and of more depths.
 """
 
-import logging
 import os
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.geometry import Indices
-from structgstream.preparation.calibration.bundle import Limits, chosen
+from structgstream.preparation.calibration.bundle import MIN_DEGREES, chosen
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
     Keypoints,
@@ -34,8 +33,6 @@ from structgstream.preparation.calibration.keypoints import (
     guided_matches,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-
-_log = logging.getLogger(__name__)
 
 Matches = Mapping[Pair, NDArray[np.uint32]]
 
@@ -131,11 +128,16 @@ def size_of(model: Any, stills: Collection[str]) -> tuple[int, int, int]:
     return sum(name in stills for name in names), len(names), model.compute_num_observations()
 
 
-def _incremental_options() -> Any:
+def _repeatable_options() -> Any:
     options = pycolmap_module().IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
+    return options
+
+
+def _incremental_options() -> Any:
+    options = _repeatable_options()
     options.min_model_size = 2
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = True
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = True
@@ -180,9 +182,9 @@ def adjust(model: Any, *, lens: bool = True) -> None:
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
-def filtered(model: Any, *, pixels: float, degrees: float) -> int:
-    """Removes observations with a larger reprojection error and points with a smaller angle; returns how many."""
-    return pycolmap_module().ObservationManager(model).filter_all_points3D(pixels, degrees)
+def filter_model(model: Any, *, pixels: float) -> None:
+    """Removes observations with a larger reprojection error, and points whose rays have too small an angle."""
+    pycolmap_module().ObservationManager(model).filter_all_points3D(pixels, MIN_DEGREES)
 
 
 def cameras_of(model: Any) -> dict[str, LensCamera]:
@@ -242,10 +244,10 @@ def posed_graph(
     return PosedGraph(keypoints, verified_pairs(keypoints, near, numbered, workers=workers))
 
 
-def triangulated(graph: PosedGraph, cameras: Mapping[str, LensCamera], *, limits: Limits) -> SolvedCalibration:
-    """The cameras with the points of the graph's matches, without observations that exceed the limits."""
-    model = posed_model(graph, cameras, pixels=limits.pixels, slack_degrees=SLACK_DEGREES)
-    filtered(model, pixels=limits.pixels, degrees=limits.degrees)
+def triangulated(graph: PosedGraph, cameras: Mapping[str, LensCamera], *, pixels: float) -> SolvedCalibration:
+    """The cameras with the points of the graph's matches, without observations that are more than ``pixels`` off."""
+    model = posed_model(graph, cameras, pixels=pixels, slack_degrees=SLACK_DEGREES)
+    filter_model(model, pixels=pixels)
     points, observations = observed(model, graph.keypoints, cameras)
     return SolvedCalibration(dict(cameras), points, observations)
 
@@ -273,10 +275,7 @@ def posed_model(
     model = pycolmap.Reconstruction()
     for camera in numbered.values():
         model.add_camera_with_trivial_rig(camera)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
-    options.extract_colors = False
+    options = _repeatable_options()
     options.mapper.filter_max_reproj_error = pixels
     making = options.triangulation
     making.create_max_angle_error = making.continue_max_angle_error = slack_degrees
@@ -308,16 +307,17 @@ def rematched(
     found: SolvedCalibration,
     keypoints: Mapping[str, Keypoints],
     *,
-    limits: Limits,
+    pixels: float,
     adjust: Callable[[SolvedCalibration], SolvedCalibration],
     workers: int,
 ) -> SolvedCalibration:
     """The first solution ``found`` adjusted to more points (Note [What a first solution lacks]); itself if it has
-    enough, little is gained or a camera loses some. ``adjust`` adjusts cameras and points together."""
+    enough, little is gained or a camera loses some. Observations may be ``pixels`` off; ``adjust`` adjusts cameras and
+    points together."""
     before = _counts(found)
     if before.min() >= ENOUGH:
         return found
-    guided = guided_matches(keypoints, found.cameras, pixels=limits.pixels, workers=workers)
+    guided = guided_matches(keypoints, found.cameras, pixels=pixels, workers=workers)
     pycolmap, geometries = pycolmap_module(), {}
     for pair, rows in guided.items():
         if len(rows):
@@ -325,16 +325,13 @@ def rematched(
             geometries[pair].config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometries[pair].inlier_matches = rows
     graph = PosedGraph({name: keypoints[name] for name in found.cameras}, geometries)
-    made = triangulated(graph, found.cameras, limits=limits)
+    made = triangulated(graph, found.cameras, pixels=pixels)
     made = replace(found, points=made.points, observations=made.observations)
     joined = _joined(_confirmed(made), _confirmed(found))
-    again = adjust(joined) if len(joined.observations) >= MIN_GAIN * before.sum() else found
-    after = _counts(again)
-    if again is found or (after < before).any():
-        _log.info("Matching again gives a camera hardly more or fewer observations; the first solution stays.")
+    if len(joined.observations) < MIN_GAIN * before.sum():
         return found
-    _log.info("Matched again: %d observations in place of %d.", after.sum(), before.sum())
-    return again
+    again = adjust(joined)
+    return found if (_counts(again) < before).any() else again
 
 
 def _counts(found: SolvedCalibration) -> Indices:

@@ -57,18 +57,14 @@ class SolvedCalibration:
     metres: bool = False  # whether the unit is a metre; otherwise it is arbitrary
     roving: RovingFrames | None = None  # None without a roving camera
 
-    def residuals(self) -> Floats:
-        """Reprojection error ``[M, 2]`` of each observation, pixels; NaN where a point is out of a lens' reach."""
+    def errors(self) -> Floats:
+        """Reprojection error ``[M]`` of each observation, pixels; NaN where a point is out of a lens' reach."""
         seen = self.observations
         found = np.full((len(seen), 2), np.nan)
         for index, filmed in enumerate(self.cameras.values()):
             own = seen.camera == index
             found[own] = filmed.pixels(self.points[seen.point[own]]) - seen.pixels[own]
-        return found
-
-    def errors(self) -> Floats:
-        """Length ``[M]`` of :meth:`residuals`, pixels."""
-        return np.linalg.norm(self.residuals(), axis=1)
+        return np.linalg.norm(found, axis=1)
 
     def track_lengths(self) -> Indices:
         """Number of observations ``[P]`` of each point."""
@@ -114,14 +110,8 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     """In metres, from the measured distance between the lenses of two cameras.
 
     Raises:
-        CalibrationError: a camera that was not placed, or a distance that is not positive.
+        CalibrationError: a distance that is not positive, or of cameras at one place.
     """
-    for name in (first, second):
-        if name not in solved.cameras:
-            raise CalibrationError(
-                f"The distance is given from camera {name!r}, which is not among the placed ones "
-                f"({', '.join(solved.cameras)})."
-            )
     one, other = (solved.cameras[name].camera.center.numpy() for name in (first, second))
     distance = float(np.linalg.norm(other - one))
     if not metres > 0 or first == second or distance == 0:

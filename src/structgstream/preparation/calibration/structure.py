@@ -24,7 +24,7 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.bundle import Limits, adjust_together, chosen
+from structgstream.preparation.calibration.bundle import adjust_together, chosen, inlier_pixels
 from structgstream.preparation.calibration.colmap import MODELS, field_of_view, guessed_camera, holding, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
     Keypoints,
@@ -39,7 +39,7 @@ from structgstream.preparation.calibration.mapping import (
     PosedGraph,
     adjust,
     cameras_of,
-    filtered,
+    filter_model,
     mapped,
     observed,
     posed_graph,
@@ -79,7 +79,8 @@ def solve_structure(
     """Poses, intrinsics and lenses of still cameras from their own pictures.
 
     Args:
-        pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras, in order of time.
+        pictures: camera name, of three or more, to pictures ``[H, W, 3]`` of the same instants for all cameras, in
+            order of time.
         lens: which distortion is estimated.
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         focals: focal lengths in pixels by name, of those cameras that state one. Fields of view that are tried begin
@@ -93,15 +94,9 @@ def solve_structure(
         observations are those of the still cameras.
 
     Raises:
-        CalibrationError: fewer than three cameras, pictures that do not belong together, too little in common, or no
-            roving frame that has.
+        CalibrationError: pictures that do not belong together, too little in common, or no roving frame that has.
     """
     pycolmap_module()
-    if len(pictures) < 3:
-        raise CalibrationError(
-            f"Structure from motion needs three cameras or more, got {listed(pictures)}: two of them do not fix "
-            "their focal lengths; film a board with both (structgstream board), or add a camera."
-        )
     workers = max(1, min(len(pictures), os.cpu_count() or 1))
     keypoints = all_keypoints(pictures, workers=workers)
     matches = all_matches(keypoints, workers=workers)
@@ -309,10 +304,10 @@ def _finished(
     model = attempt.model
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
-    limits = Limits.for_pictures(longest)
+    pixels = inlier_pixels(longest)
     for _ in range(2):
         adjust(model)
-        filtered(model, pixels=limits.pixels, degrees=limits.degrees)
+        filter_model(model, pixels=pixels)
     found = cameras_of(model)
     cameras = {name: found[name] for name in (*pictures, *roving) if name in found}
     points, observations = observed(model, keypoints, cameras)
@@ -324,13 +319,13 @@ def _finished(
         adjust_together,
         lens=[lenses.index(numbers[name]) for name in cameras],
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
-        limits=limits,
+        pixels=pixels,
         makes=[name in roving for name in cameras] if roving else None,
     )
     if roving:
         return normalized(_split(adjusted(normalized(rough)), roving))
     return normalized(
-        rematched(normalized(adjusted(rough)), keypoints, limits=limits, adjust=adjusted, workers=workers)
+        rematched(normalized(adjusted(rough)), keypoints, pixels=pixels, adjust=adjusted, workers=workers)
     )
 
 
@@ -410,15 +405,15 @@ def refine(
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
     refined = dict(cameras)
     models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
-    limits = Limits.for_pictures(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
+    pixels = inlier_pixels(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
     model = None
     for share in ROUNDS:
         slack = SLACK_DEGREES * share
         focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
-        loose = max(limits.pixels, focal * float(np.radians(slack)))
+        loose = max(pixels, focal * float(np.radians(slack)))
         model = posed_model(learning, refined, pixels=loose, slack_degrees=slack, models=models)
         adjust(model, lens=lens is not None)
-        filtered(model, pixels=limits.pixels, degrees=limits.degrees)
+        filter_model(model, pixels=pixels)
         adjust(model, lens=lens is not None)
         found = cameras_of(model)
         refined = {name: found[name] for name in cameras}
@@ -429,8 +424,8 @@ def refine(
     if after < before:
         terms = (FOCAL, ASPECT, *(DISTORTION[lens] if lens else ()))
         # All tracks, the held-out ones included, with what alike lenses share.
-        everything = normalized(triangulated(graph, result.cameras, limits=limits))
-        everything = adjust_together(everything, lens=range(len(cameras)), free=terms, limits=limits)
+        everything = normalized(triangulated(graph, result.cameras, pixels=pixels))
+        everything = adjust_together(everything, lens=range(len(cameras)), free=terms, pixels=pixels)
         everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
         if _judged(graph, judges, everything.cameras) <= after:
             result = everything
@@ -439,7 +434,7 @@ def refine(
         "Refining does not help: matches that were held out are %.2f pixels off with the given cameras and %.2f with "
         "refined ones; the given ones stay.", before, after,
     )  # fmt: skip
-    given = triangulated(graph, cameras, limits=limits)
+    given = triangulated(graph, cameras, pixels=pixels)
     return Refinement(replace(given, metres=metres), before, after, count, False)
 
 

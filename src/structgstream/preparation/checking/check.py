@@ -229,8 +229,7 @@ def _camera_checks(
     found = {}
     for name in source.rig:
         color = examined.colors.get(name)
-        own = np.zeros(len(tracks.point), bool) if name not in tracks.names else tracks.of(name)
-        residuals = tracks.residuals[own & (views[tracks.point] >= MIN_VIEWS)]
+        residuals = tracks.residuals[tracks.of(name) & (views[tracks.point] >= MIN_VIEWS)]
         residuals = residuals[np.isfinite(residuals)]
         found[name] = CameraCheck(
             reprojection_pixels=float(np.median(residuals)) if len(residuals) else None,

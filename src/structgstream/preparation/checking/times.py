@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource, apart_seconds
+from structgstream.errors import import_extra
 from structgstream.pose_check.check import Finding
-from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
     CalibratedGeometry,
     Changes,
@@ -73,7 +73,7 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
 
     Held-out cameras are checked, too: nothing is fitted to their pictures.
     """
-    require_scipy()
+    import_extra("scipy", "capture")
     period = 1 / source.fps
     changes = _changes(source)
     cameras = {name: LensCamera(source.rig[name], Pinhole()) for name in source.rig}

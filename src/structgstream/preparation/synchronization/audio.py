@@ -3,9 +3,8 @@
 
 Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do not
 matter. Onsets are smoothed, so that sounds from several places agree on one lag. Fine: in windows with many onsets the
-phases of spectra are compared (GCC-PHAT: Knapp and Carter, 1976), at the same frequencies in hertz, so that rates of
-samples may differ. Windows that agree give the lag; where they do not, because each picks up another source, the
-coarse one is taken.
+phases of spectra are compared (GCC-PHAT: Knapp and Carter, 1976). Windows that agree give the lag; where they do not,
+because each picks up another source, the coarse one is taken.
 
 Sound needs 2.9 ms a metre. Where a room is louder than the direct sound, the highest peak may be one of echoes, in all
 windows alike: what the other peaks of a pair leave open is part of its error, less so where lags close loops of three
@@ -21,8 +20,12 @@ from numpy.typing import NDArray
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CaptureError
 from structgstream.geometry import Floats
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.synchronization.correlation import Signal, best_lag, parabola_top
 from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, solve_clocks
+
+Samples = NDArray[np.float32]
+"""Mono ``[N]`` at ``SAMPLE_RATE``."""
 
 WINDOW_SECONDS = 2
 LOW_HERTZ, HIGH_HERTZ = 150.0, 8000.0
@@ -45,15 +48,7 @@ class Window:
     square; 0 where it was not looked at."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Mono samples ``[N]`` at ``rate`` hertz."""
-
-    samples: NDArray[np.float32]
-    rate: float
-
-
-def phase_window(one: Recording, other: Recording, middle: float, lag: float) -> Window | None:
+def phase_window(one: Samples, other: Samples, middle: float, lag: float) -> Window | None:
     """A window around ``middle`` of the first clock, whose lag is near ``lag``; None if no lag stands out."""
     from scipy.fft import irfft
 
@@ -61,9 +56,8 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
     if any(spectrum is None for spectrum in spectra):
         return None
     (first, shift_first), (second, shift_second) = (spectrum for spectrum in spectra if spectrum is not None)
-    bins = min(len(first), len(second))
-    hertz = np.arange(bins) / (2 * WINDOW_SECONDS)
-    cross = np.conj(_whitened(first[:bins])) * _whitened(second[:bins])
+    hertz = np.arange(len(first)) / (2 * WINDOW_SECONDS)
+    cross = np.conj(_whitened(first)) * _whitened(second)
     cross[(hertz < LOW_HERTZ) | (hertz > HIGH_HERTZ)] = 0
     curve = np.asarray(irfft(cross, 2 * WINDOW_SECONDS * GRID_HERTZ))
     level = float(np.sqrt(np.mean(curve**2)))
@@ -104,19 +98,19 @@ def _whitened(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
     return spectrum / np.maximum(magnitude, 1e-9 * float(magnitude.max()) + 1e-300)
 
 
-def _spectrum(sound: Recording, middle: float) -> tuple[NDArray[np.complex128], float] | None:
+def _spectrum(samples: Samples, middle: float) -> tuple[NDArray[np.complex128], float] | None:
     """Spectrum, zero padded to twice the window, and by how many seconds the window starts later than requested."""
     from scipy.fft import rfft
 
-    length = round(WINDOW_SECONDS * sound.rate)
-    wanted = (middle - WINDOW_SECONDS / 2) * sound.rate
+    length = WINDOW_SECONDS * SAMPLE_RATE
+    wanted = (middle - WINDOW_SECONDS / 2) * SAMPLE_RATE
     first = round(wanted)
     window = np.zeros(length)
-    low, high = max(first, 0), min(first + length, len(sound.samples))
+    low, high = max(first, 0), min(first + length, len(samples))
     if high - low < 0.4 * length:
         return None
-    window[low - first : high - first] = sound.samples[low:high]
-    return np.asarray(rfft(window * np.hanning(length), 2 * length)), (first - wanted) / sound.rate
+    window[low - first : high - first] = samples[low:high]
+    return np.asarray(rfft(window * np.hanning(length), 2 * length)), (first - wanted) / SAMPLE_RATE
 
 
 CLOSING_SECONDS = 3e-4  # by which the lags of a loop may miss each other
@@ -205,9 +199,10 @@ def _mapped(known: dict[tuple[str, str], PairLag], first: str, second: str, seco
 
 
 @dataclass(frozen=True)
-class Sound(Recording):
+class Sound:
     """A recording and its onsets."""
 
+    samples: Samples
     onsets: Signal
 
 
@@ -220,12 +215,11 @@ class UnusableSoundError(CaptureError):
         self.reason = reason
 
 
-def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
+def sound_of(name: str, samples: Samples) -> Sound:
     """What camera ``name`` recorded; silence, or less than a second, is an :class:`UnusableSoundError`."""
-    samples, rate = audio
-    if len(samples) < MIN_OVERLAP_SECONDS * rate:
+    if len(samples) < MIN_OVERLAP_SECONDS * SAMPLE_RATE:
         raise UnusableSoundError(
-            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {MIN_OVERLAP_SECONDS:g} s "
+            f"Camera {name!r} has {len(samples) / SAMPLE_RATE:.2f} s of sound, less than the {MIN_OVERLAP_SECONDS:g} s "
             "that can be compared",
             "synchronise by motion or timestamps.csv",
         )
@@ -234,7 +228,7 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
             f"The sound of camera {name!r} is silence",
             "switch its microphone on, or synchronise by motion or timestamps.csv",
         )
-    return Sound(samples, rate, _onsets(samples, rate))
+    return Sound(samples, _onsets(samples))
 
 
 def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
@@ -242,17 +236,15 @@ def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
     return [lag for pair in _pairs(list(sounds)) if (lag := _pair_lag(*pair, sounds)) is not None]
 
 
-def solve_by_audio(
-    takes: Mapping[str, tuple[float, float]], lags: Sequence[PairLag], *, drift: bool = True
-) -> Solution:
-    """Clocks by sound, with rates other than 1 where ``drift`` is considered.
+def solve_by_audio(takes: Mapping[str, tuple[float, float]], lags: Sequence[PairLag]) -> Solution:
+    """Clocks by sound.
 
     Args:
         takes: camera to the first and last second of its take.
         lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
     """
     # A wrong peak is off by as much in all windows of a pair: drift is estimated from windows, offsets from pairs.
-    sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=drift, slack_seconds=SLACK_SECONDS)
+    sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=True, slack_seconds=SLACK_SECONDS)
     rates = sharp.rates
     matches = [
         replace(
@@ -292,7 +284,7 @@ def _pair_lag(first: str, second: str, sounds: Mapping[str, Sound]) -> PairLag |
     found = [
         window
         for middle in _windows(one.onsets, other.onsets, coarse.seconds)
-        if (window := phase_window(one, other, middle, coarse.seconds)) is not None
+        if (window := phase_window(one.samples, other.samples, middle, coarse.seconds)) is not None
     ]
     agreeing = _on_a_line(found)
     if not agreeing:
@@ -351,18 +343,16 @@ def _on_a_line(found: list[Window]) -> list[Window]:
     return [window for window, agrees in zip(found, best, strict=True) if agrees]
 
 
-def _onsets(samples: NDArray[np.float32], rate: float) -> Signal:
+def _onsets(samples: Samples) -> Signal:
     """Smoothed increases ``[T, B]`` of the logarithm of the energy in each band, above the band's usual energy."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import butter, sosfilt
 
-    count = int(len(samples) / rate / STEP_SECONDS)
-    bounds = np.rint(np.arange(count + 1) * STEP_SECONDS * rate).astype(int)
+    count = int(len(samples) / SAMPLE_RATE / STEP_SECONDS)
+    bounds = np.rint(np.arange(count + 1) * STEP_SECONDS * SAMPLE_RATE).astype(int)
     channels = []
     for low, high in pairwise(BANDS_HERTZ):
-        if low >= 0.4 * rate:
-            continue
-        filter_ = butter(2, (low, min(high, 0.45 * rate)), "bandpass", fs=rate, output="sos")
+        filter_ = butter(2, (low, high), "bandpass", fs=SAMPLE_RATE, output="sos")
         power = np.asarray(sosfilt(filter_, samples)) ** 2
         energy = np.add.reduceat(power, bounds[:-1])[:count] / np.diff(bounds)
         level = np.log(energy + max(float(np.median(energy)), 1e-12 * float(energy.max()), 1e-30))

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from structgstream.errors import MissingExtraError
 from structgstream.geometry import Floats, Indices
 
 GROUPS = 8  # of channels, left out one by one to see how the peak moves
@@ -54,14 +53,6 @@ class Lag:
     rival: float  # largest such value outside the peak
     deviation: float  # standard deviation of such values over all lags, as chance makes them
     middle: float  # the middle of the overlap, by the first signal's time
-
-
-def require_scipy() -> None:
-    """Refuses to go on without scipy, by a ``MissingExtraError``."""
-    try:
-        import scipy  # noqa: F401
-    except ImportError:
-        raise MissingExtraError("scipy", "capture") from None
 
 
 def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:

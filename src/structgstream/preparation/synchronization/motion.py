@@ -289,14 +289,14 @@ class PairSignals:
     estimated: bool = False  # whether the epipolar geometry is an estimate that may be wrong
 
 
-def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:
+def pair_signals(changes: Mapping[str, Changes], geometry: Geometry) -> list[PairSignals]:
     """Signals of all pairs of cameras in which something moves: of epipolar lines where the geometry is known."""
     moving = [name for name, change in changes.items() if change.moving]
     found = []
     for first, second in combinations(moving, 2):
         one, other = changes[first], changes[second]
         step = min(period_seconds(one.times), period_seconds(other.times))
-        pair = geometry.pair(first, second) if geometry else None
+        pair = geometry.pair(first, second)
         values = line_signals(one, other, pair) if pair else None
         both = values or (one.activity, other.activity)
         signals = resampled(both[0], one.times, step=step), resampled(both[1], other.times, step=step)
@@ -461,8 +461,7 @@ def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> lis
     line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
     if line is None:
         return []
-    min_overlap = MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
-    sigma = max(line.lag_sigma, min_overlap)
+    sigma = max(line.lag_sigma, MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2)
     if line.rate is None:
         return [_line_match(pair, line, 0.0, sigma)]
     sigma = max(sigma, line.rate_sigma * line.spread_seconds)

@@ -49,7 +49,6 @@ class Solution:
     sigmas: Mapping[str, float]
     """Camera to the standard error of its common time at the ends of its take, relative to the mean of all cameras."""
     agreeing: tuple[bool, ...]  # for each correspondence whether it agrees
-    residuals: tuple[float, ...]  # for each correspondence the difference of its two common times, seconds
 
 
 @dataclass(frozen=True)
@@ -95,9 +94,8 @@ def solve_clocks(
     free = np.zeros(len(names), bool)
     unknown = np.zeros(len(names))
     offsets, _, weights, covariance = _reweighted(graph, offsets, corrections, free, slack_seconds)
-    if drift and len(names) > 1:
+    if drift:
         offsets, corrections, weights, covariance, unknown = _with_rates(graph, offsets, halves, slack_seconds)
-    residuals = _residuals(graph, offsets, corrections)
     variances = _relative_variances(covariance, len(names))
     spread = np.sqrt(variances[0] + halves**2 * (variances[1] + unknown))
     rates = (1 + corrections) / (1 + corrections[0])
@@ -108,7 +106,6 @@ def solve_clocks(
         rates=dict(zip(names, rates.tolist(), strict=True)),
         sigmas=dict(zip(names, spread.tolist(), strict=True)),
         agreeing=tuple((weights > 0).tolist()),
-        residuals=tuple(residuals.tolist()),
     )
 
 
@@ -280,7 +277,7 @@ def _with_rates(
         errors = np.sqrt(_relative_variances(covariance, graph.cameras)[1])
         # Rates are relative: compared with the median, cameras of one kind of clock keep rate 1 together.
         relative = corrections - (np.median(corrections) if free.all() else 0.0)
-        effect = np.abs(relative) * 2 * halves * (2 if graph.cameras == 2 else 1)
+        effect = np.abs(relative) * 2 * halves
         strength = np.minimum(np.abs(relative) / (RATE_SIGMAS * errors + 1e-300), effect / RATE_EFFECT_SECONDS)
         weak = np.flatnonzero(free & (strength < 1))
         if not len(weak):

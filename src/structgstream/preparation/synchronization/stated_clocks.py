@@ -29,7 +29,6 @@ from structgstream.geometry import Floats
 
 COLUMNS = ("camera", "frame", "seconds")
 MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
-RATE_ROWS = 2
 MAX_DRIFT = 0.01
 MIN_DRIFT_SECONDS, MIN_DRIFT_UNITS = 1e-3, 2.0
 """Between a camera's first and last row, the latter in units of the last decimal: less may be rounding, no drift."""
@@ -114,7 +113,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats, *, 
         )
     own, period = stamps[frames], period_seconds(stamps)
     rate = 1.0
-    if len(frames) >= RATE_ROWS and own[-1] - own[0] > 0:
+    if own[-1] > own[0]:
         rate = float(np.polyfit(own - own.mean(), seconds, 1)[0])
         if abs(rate - 1) * (own[-1] - own[0]) < least:
             rate = 1.0

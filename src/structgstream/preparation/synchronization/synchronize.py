@@ -13,8 +13,9 @@ import numpy as np
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock, counted_rate, period_seconds
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.errors import CaptureError, ConfigError, import_extra
 from structgstream.geometry import Floats
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
@@ -24,7 +25,6 @@ from structgstream.preparation.synchronization.audio import (
     solve_by_audio,
     sound_of,
 )
-from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
     CalibratedGeometry,
     Changes,
@@ -171,7 +171,7 @@ def synchronize(
         found = wall_clocks(stamps, {name: footage.metadata(name) for name in stamps})
         reason = f"stamps of the files ({next(iter(found.values())).kind}) are said to share a clock"
         return _stated(stamps, found, method="stamps", reason=reason)
-    require_scipy()
+    import_extra("scipy", "capture")
     if method == "motion":
         return _by_motion(footage, stamps, cameras, "motion was requested")
     if method == "audio":
@@ -213,7 +213,7 @@ def _by_audio(footage: Footage, stamps: Mapping[str, Floats], reason: str) -> Sy
         raise UnusableSoundError(f"Camera {mute!r} has no sound", "synchronise by motion or timestamps.csv")
     sounds = {name: sound_of(name, sound) for name, sound in recorded.items() if sound is not None}
     lags = audio_lags(sounds)
-    takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
+    takes = {name: (0.0, len(sound.samples) / SAMPLE_RATE) for name, sound in sounds.items()}
     groups = connected_by(list(takes), lags)
     if len(groups) > 1:
         others = ", ".join(repr(name) for group in groups[1:] for name in group)
@@ -239,8 +239,6 @@ def _by_audio(footage: Footage, stamps: Mapping[str, Floats], reason: str) -> Sy
 def _by_motion(
     footage: Footage, stamps: Mapping[str, Floats], cameras: Mapping[str, LensCamera] | None, reason: str
 ) -> Synchronization:
-    if len(stamps) < 2:
-        return _unchanged(stamps)
     used = {name: own[own <= own[0] + MOTION_SECONDS] for name, own in stamps.items()}
     changes = {name: picture_changes(footage.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
     require_motion(changes)
