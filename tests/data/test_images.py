@@ -93,11 +93,13 @@ def test_pictures_are_matched_by_name_not_by_count() -> None:
         "a": {name: Path(f"a/{name}.png") for name in ("8", "9", "10")},
         "b": {name: Path(f"b/{name}.png") for name in ("9", "10", "11")},
     }
-    common, instants = common_pictures(files, where=Path("take"))
+    common, instants = common_pictures(files, where=Path("take"), training=files)
     assert instants == ("9", "10")
     assert common == {name: (Path(f"{name}/9.png"), Path(f"{name}/10.png")) for name in "ab"}
     del files["a"]["9"]
-    common, instants = common_pictures({**files, "b": {**files["b"], "8": Path("b/8.png")}}, where=Path("take"))
+    common, instants = common_pictures(
+        {**files, "b": {**files["b"], "8": Path("b/8.png")}}, where=Path("take"), training=files
+    )
     assert common["a"] == (Path("a/8.png"), None, Path("a/10.png"))
 
 

@@ -38,7 +38,7 @@ PICTURE_SUFFIXES = frozenset({
     ".jpe", ".jp2", ".pgm", ".ppm",
 })  # fmt: skip
 HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
-TIFF_ORIENTATION = 0x0112  # the tag
+ORIENTATION = 0x0112  # the tag, in EXIF as in TIFF
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
 
@@ -100,7 +100,7 @@ def opencv() -> ModuleType:
 
 
 def common_pictures(
-    files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str] | None = None
+    files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str]
 ) -> tuple[dict[str, tuple[Path | None, ...]], tuple[str, ...]]:
     """The pictures of the time steps of a capture, of which cameras may lack some: by camera that of each step, None
     where it has none; and the names of the steps.
@@ -249,7 +249,7 @@ def _upright_tiff(data: bytes) -> bytes:
         (at,) = struct.unpack_from(f"{order}I", data, 4)
         (count,) = struct.unpack_from(f"{order}H", data, at)
         for entry in range(at + 2, at + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == TIFF_ORIENTATION:
+            if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
                 struct.pack_into(f"{order}H", changed, entry + 8, 1)
     except struct.error:
         return data  # cut, which the decoder notices
@@ -389,7 +389,7 @@ def _opened(path: Path) -> Iterator["ImageFile | None"]:
         yield picture
 
 
-ORIENTATION, EXIF_IFD = 0x0112, 0x8769
+EXIF_IFD = 0x8769
 FOCAL_LENGTH, FOCAL_35MM = 0x920A, 0xA405
 PLANE_RESOLUTION, PLANE_UNIT, PIXELS_ACROSS, PIXELS_DOWN = 0xA20E, 0xA210, 0xA002, 0xA003
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
