@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.images import opencv, read_picture, reduced_mask
+from structgstream.data.images import opencv, read_picture, reduced_mask, reduced_picture
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.prepared import ROVING, PreparedCamera, PreparedCapture
 from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, closed, resized_to
@@ -111,7 +111,7 @@ class WithRoving(SourceWrapper):
         if len(self.whole) < MIN_INSTANTS:
             return {}
         return {
-            name: differs(reduced(frame.images[name]), self._still[name])
+            name: differs(reduced_picture(frame.images[name], REDUCED_SIDE), self._still[name])
             for name in self.rig.training
             if name in frame.images and name in self._still
         }
@@ -126,7 +126,7 @@ class WithRoving(SourceWrapper):
                 shown = next(frames, None)
             images = {} if shown is None else shown.images
             for name in seen.keys() & images.keys():
-                seen[name].append(reduced(images[name]))
+                seen[name].append(reduced_picture(images[name], REDUCED_SIDE))
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
@@ -182,14 +182,6 @@ def joined(
     masks = {**frame.masks, **{name: own.mask for name, own in more.items()}}
     cameras = {**rig.cameras, **{name: own.camera for name, own in more.items()}}
     return replace(frame, images=images, masks=masks), CameraRig(cameras, rig.held_out)
-
-
-def reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture ``[H, W, 3]`` at the size at which changes are looked for."""
-    height, width = picture.shape[:2]
-    factor = min(1.0, REDUCED_SIDE / max(width, height))
-    size = max(round(width * factor), 1), max(round(height * factor), 1)
-    return np.asarray(opencv().resize(picture, size, interpolation=opencv().INTER_AREA), np.uint8)
 
 
 def most_frequent(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
