@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.images import opencv, read_picture, reduced_mask, reduced_picture
+from structgstream.data.matching import inside, project, rays_of_pixels
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.prepared import ROVING, PreparedCamera, PreparedCapture
 from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, closed, resized_to
@@ -208,19 +209,12 @@ def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray
     small = camera.scaled(min(1.0, REDUCED_SIDE / max(camera.width, camera.height)))
     found = np.zeros((small.height, small.width), bool)
     if changed:
-        eye, rays = _rays(small)
+        eye, rays = small.center.numpy(), rays_of_pixels(small) @ small.viewmat[:3, :3].numpy()
         for depth in _depths(eye, small.near, rig, changed):
             found |= moving_places(eye + depth * rays, rig, changed)
     # Its pixels are areas of the picture's.
     whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)
     return np.asarray(whole, bool)
-
-
-def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """Centre ``[3]`` of ``camera``, and for each pixel ``[H, W, 3]`` the way from it to depth 1."""
-    across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(camera.K.numpy()).T
-    return camera.center.numpy(), flat @ camera.viewmat[:3, :3].numpy()
 
 
 def _depths(eye: Floats, near: float, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Floats:
@@ -235,8 +229,7 @@ def hull_points(rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Flo
     found = [np.zeros((0, 3))]
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
-        eye, rays = _rays(camera)
-        rays = rays[mask]
+        eye, rays = camera.center.numpy(), (rays_of_pixels(camera) @ camera.viewmat[:3, :3].numpy())[mask]
         for depth in _depths(eye, camera.near, rig, changed):
             places = eye + depth * rays
             moving = moving_places(places, rig, changed)
@@ -250,11 +243,9 @@ def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[
     seen, moving = np.zeros((2, *points.shape[:-1]), np.int16)
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
-        local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
-        ahead = local[..., 2] > camera.near
-        pixels = local @ camera.K.numpy().T / np.where(ahead, local[..., 2], 1.0)[..., None]
-        column, row = (np.floor(pixels[..., axis]).clip(-1, 2**20).astype(int) for axis in (0, 1))
-        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        seen += inside
-        moving += inside & mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+        pixels, depths = project(camera, points)
+        shown = inside(camera, pixels, depths, near=camera.near)
+        column, row = pixels[shown].astype(int).T
+        seen += shown
+        moving[shown] += mask[row, column]
     return (seen >= MIN_SEEN) & (moving == seen)
