@@ -28,6 +28,7 @@ from tests.support.captures import (
     HEIGHT,
     WIDTH,
     all_numbers,
+    edit_json,
     numbers,
     picture,
     small_rig,
@@ -47,12 +48,6 @@ def content(
         filmed = LensCamera(camera, lens)
         cameras[name] = PreparedCamera(f"{folder}/{name}{suffix}", filmed, rectilinear(filmed))
     return PreparedCapture(cameras, 30.0, 0.25, "metres", frozenset({"cam01"}))
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    values = json.loads((path / FILE).read_text())
-    change(values)
-    (path / FILE).write_text(json.dumps(values))
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -181,7 +176,7 @@ def test_points_come_along_unless_another_camera_is_held_out(tmp_path: Path) -> 
 
 def test_a_later_version_is_refused(tmp_path: Path) -> None:
     write_prepared(tmp_path, content())
-    edit(tmp_path, lambda values: values.update(version=2))
+    edit_json(tmp_path / FILE, lambda values: values.update(version=2))
     with pytest.raises(CalibrationError, match=r"version 2; this program reads .*version 1: prepare the capture again"):
         read_prepared(tmp_path)
 
@@ -214,7 +209,7 @@ def test_broken_content_names_its_camera(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], reported: str
 ) -> None:
     write_prepared(tmp_path, content())
-    edit(tmp_path, change)
+    edit_json(tmp_path / FILE, change)
     with pytest.raises(CalibrationError, match=reported):
         read_prepared(tmp_path)
 
