@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -75,17 +74,6 @@ def test_a_camera_to_hold_out_that_there_is_none_of(tmp_path: Path) -> None:
     write_prepared(tmp_path, replace(content(), held_out=frozenset({"nobody"})))
     with pytest.raises(CalibrationError, match=r"capture\.json holds out camera 'nobody', .*its cameras are cam00, "):
         read_prepared(tmp_path)
-
-
-def test_tone_curves_of_earlier_versions_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    wanted = content()
-    write_prepared(tmp_path, wanted)
-    stored = json.loads((tmp_path / FILE).read_text())
-    for number, camera in enumerate(stored["cameras"].values()):
-        camera["tone"] = [[0.1 * step for step in range(8)]] * 3 if number == 0 else None
-    (tmp_path / FILE).write_text(json.dumps(stored))
-    assert [*read_prepared(tmp_path).cameras] == [*wanted.cameras]
-    assert "has tone curves, which are not applied any more" in caplog.text
 
 
 def test_videos_are_opened_in_step(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ calibrated again without touching what was filmed. A broken file is a ``Calibrat
 """
 
 import json
-import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -38,7 +37,6 @@ EXPECTED = "a capture that structgstream prepare wrote (docs/captures.md)"
 LENSES: Mapping[str, type[Lens]] = {"pinhole": Pinhole, "opencv": RadialTangential, "fisheye": Fisheye}
 
 Unit = Literal["metres", "arbitrary"]
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -116,8 +114,6 @@ def read_prepared(path: Path) -> PreparedCapture:
         if content["unit"] not in ("metres", "arbitrary"):
             raise Unreadable(f"unit {content['unit']!r}")
         cameras = {name: _read_camera(name, entry, file) for name, entry in entries.items()}
-        if any(entry.get("tone") for entry in entries.values()):
-            _log.warning("%s has tone curves, which are not applied any more; pictures are read as filmed.", file)
         check_held_out(content["held_out"], cameras, where=file)
         return PreparedCapture(
             cameras=cameras,
