@@ -13,7 +13,7 @@ from av.codec.context import Flags
 
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CaptureError
 from tests.support.captures import Picture, picture, small_rig, write_videos
 
 RIG = small_rig(3)
@@ -70,13 +70,6 @@ def test_turned_videos_are_read_as_they_are_shown(tmp_path: Path, turn: int, qua
     half = rig.mapped({name: rig[name].resized(size[0] // 2, size[1] // 2) for name in rig})
     smaller = next(source.resized(half).frames()).images["cam01"]
     np.testing.assert_allclose(smaller, expected[::2, ::2], atol=4)
-
-
-def test_a_turned_video_has_the_size_that_is_shown(tmp_path: Path) -> None:
-    for name in RIG:
-        write(tmp_path / f"{name}.mp4", corners(), turn=90)
-    with pytest.raises(CalibrationError, match="has 48x64 pixels, the intrinsics of camera 'cam00' are for 64x48"):
-        synchronised(scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG}), RIG, where=tmp_path)
 
 
 def refusal(path: Path) -> str:
