@@ -212,7 +212,7 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     except OSError as error:
         raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
-        data = _converted_heif(path, data)
+        return _heif_picture(path, data)
     if not data or is_cut_jpeg(data):
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
@@ -270,17 +270,16 @@ def is_cut_jpeg(data: bytes) -> bool:
     return data.find(b"\xff\xd9", at) < 0
 
 
-def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A HEIC or AVIF picture as PNG: HEIC is turned as it is shown, AVIF remains as it is stored."""
+def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
+    """The values of a HEIC or AVIF picture: HEIC is turned as it is shown, AVIF remains as it is stored."""
     is_avif = data[8:12] in (b"avif", b"avis")
     needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
-    missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")
     try:
         if is_avif:
             from PIL import Image, features
 
             if not features.check("avif"):
-                raise missing
+                raise ImportError
             image = Image.open(io.BytesIO(data))
         else:
             import pillow_heif  # pyright: ignore[reportMissingImports]
@@ -288,12 +287,12 @@ def _converted_heif(path: Path, data: bytes) -> bytes:
             image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
         pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
     except ImportError:
-        raise missing from None
-    except CaptureError:
-        raise
+        raise CaptureError(
+            f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG."
+        ) from None
     except Exception:  # a damaged one can raise anything
         raise _undecodable(path, data) from None
-    return bytes(opencv().imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])[1])
+    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
 def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
