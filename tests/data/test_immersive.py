@@ -38,14 +38,6 @@ def test_the_layout_is_recognised_and_halved_as_published(tmp_path: Path) -> Non
     assert all_numbers(source.frames(1)) == [[(camera, 2) for camera in range(4)]]
 
 
-def test_a_camera_without_a_video_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Some published scenes lack some of the 46."""
-    write_immersive(tmp_path)
-    (tmp_path / "camera_0003.mp4").unlink()
-    assert list(open_immersive(tmp_path).rig) == ["camera_0001", "camera_0002", "camera_0004"]
-    assert "has no pictures of camera 'camera_0003' of " in caplog.text
-
-
 def test_a_video_without_calibration_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """02_Flames has 46 videos and calibrates 45."""
     write_immersive(tmp_path)

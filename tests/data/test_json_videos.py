@@ -82,10 +82,3 @@ def test_smaller_pictures_than_the_calibration_is_for(tmp_path: Path) -> None:
     for name in rig:
         assert (source.rig[name].width, source.rig[name].height) == (rig[name].width, rig[name].height)
         torch.testing.assert_close(source.rig[name].K, rig[name].K)
-
-
-def test_pictures_of_other_proportions(tmp_path: Path) -> None:
-    write_clip(tmp_path)
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(height=content["height"] + 16))
-    with pytest.raises(CalibrationError, match=r"'cam00' have .*cameras\.json is for .*: other proportions"):
-        open_json_videos(tmp_path)

@@ -114,13 +114,6 @@ def change(path: Path, rows: slice, column: int, value: float) -> None:
     np.save(path / "poses_bounds.npy", poses)
 
 
-def test_other_proportions_are_refused(tmp_path: Path) -> None:
-    write_n3dv(tmp_path)
-    change(tmp_path, slice(None), 4, 60)  # the height
-    with pytest.raises(CalibrationError, match=r"pictures of camera .cam00. have 64x48 pixels, .* is for 64x60"):
-        open_n3dv(tmp_path)
-
-
 def test_one_pose_per_video(tmp_path: Path) -> None:
     write_n3dv(tmp_path)
     (tmp_path / "cam03.mp4").unlink()

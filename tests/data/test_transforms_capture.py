@@ -172,16 +172,3 @@ def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:
     edit_json(tmp_path / "transforms.json", change)
     source = open_capture(tmp_path)
     assert (len(source), source.fps, list(source.rig)) == (FRAMES, 60.0, ["cam00", "cam01", "cam02"])
-
-
-@pytest.mark.parametrize("file", ["/data/scene/images/CAM/FRAME.png", "images/CAM/FRAME", "images/CAM/FRAME.jpg"])
-def test_paths_of_other_machines(tmp_path: Path, file: str) -> None:
-    write(tmp_path, "images/CAM/FRAME.png")
-
-    def change(content: dict) -> None:
-        for number, entry in enumerate(content["frames"]):
-            camera, frame = divmod(number, FRAMES)
-            entry["file_path"] = file.replace("CAM", f"cam{camera:02d}").replace("FRAME", f"{frame:04d}")
-
-    edit_json(tmp_path / "transforms.json", change)
-    assert all_numbers(open_capture(tmp_path).frames(1))[0] == [(camera, 1) for camera in range(3)]
