@@ -1,16 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures of pictures or videos with a calibration that names them: a COLMAP model, or a file of another tool.
 
-::
-
-    images/CAMERA/FRAME.ext     one folder per camera
-    frames/FRAME/CAMERA.ext     one folder per frame
-    CAMERA.mp4                  one video per camera, in the folder itself or in videos/
-    images/CAMERA.ext           one picture per camera: a capture of one frame
-
-and where else ``camera_files`` finds them. Which of the two layouts it is follows from the calibration: a
-camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was calibrated
-(``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
+They lie where ``camera_files`` finds them. Whether a folder of pictures is of a camera or of a frame follows from the
+calibration: a camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was
+calibrated (``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
 """
 
 import logging
