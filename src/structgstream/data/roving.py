@@ -240,7 +240,8 @@ def hull_points(rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Flo
 
 def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Which places ``[..., 3]`` all still cameras that see them take for moving."""
-    seen, moving = np.zeros((2, *points.shape[:-1]), np.int16)
+    seen = np.zeros(points.shape[:-1], np.int16)
+    moving = np.zeros_like(seen)
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
         pixels, depths = project(camera, points)
