@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.timeline import common_slots, instants_of, natural
-from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+from structgstream.errors import CalibrationError, CaptureError, MissingExtraError, import_extra
 from structgstream.frames import MultiViewFrame
 
 if TYPE_CHECKING:
@@ -92,11 +92,7 @@ class ImageSource:
 
 def opencv() -> ModuleType:
     """The module ``cv2``, from the extra ``capture``."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
-    return cv2
+    return import_extra("cv2", "capture")
 
 
 def common_pictures(
