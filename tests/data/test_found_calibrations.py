@@ -6,12 +6,14 @@ import logging
 import shutil
 import unicodedata
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import from_integer_centers
 from structgstream.data.open import open_capture, read_calibrated
 from structgstream.errors import CalibrationError, CaptureError
@@ -297,7 +299,9 @@ def test_calibrated_cameras_without_pictures_are_reported(tmp_path: Path, caplog
 def test_calibrations_that_differ_are_refused(tmp_path: Path) -> None:
     cameras = truths()
     write_anipose(tmp_path, cameras).rename(tmp_path / "monday.toml")
-    write_anipose(tmp_path, cameras).rename(tmp_path / "copy.toml")
+    turn = rotation_matrix(np.array([0.4, -1.2, 2.0]))
+    elsewhere = [replace(own, R=own.R @ turn.T, T=2.5 * own.T - own.R @ turn.T @ [3.0, -1.0, 0.5]) for own in cameras]
+    write_anipose(tmp_path, elsewhere).rename(tmp_path / "copy.toml")  # in another world and unit
     found = read_calibrated(tmp_path)
     assert found is not None
     assert found.where.name == "copy.toml"
