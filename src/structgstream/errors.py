@@ -81,5 +81,5 @@ def import_extra(module: str, extra: str) -> typing.Any:
     """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing."""
     try:
         return importlib.import_module(module)
-    except ModuleNotFoundError:
+    except ImportError:
         raise MissingExtraError(module.partition(".")[0], extra) from None

@@ -48,7 +48,7 @@ def test_sample_k_sounds_at_k_over_the_rate(tmp_path: Path, start: float) -> Non
 
 
 def test_another_rate_is_converted(tmp_path: Path) -> None:
-    samples = read_audio(with_sound(tmp_path / "a.mkv", rate=16_000), rate=RATE)
+    samples = read_audio(with_sound(tmp_path / "a.mkv", rate=16_000))
     assert samples is not None
     assert int(np.abs(samples).argmax()) == pytest.approx(0.5 * RATE, abs=60)
 

@@ -29,6 +29,7 @@ from tests.support.captures import (
     WIDTH,
     picture,
     small_rig,
+    write_binary_model,
     write_clip,
     write_immersive,
     write_n3dv,
@@ -110,36 +111,11 @@ def test_files_of_tools(tool: str, tmp_path: Path) -> None:
 def test_models_of_colmap(binary: bool, tmp_path: Path) -> None:
     rig = small_rig(3)
     pictures = [(f"{name}.png", name) for name in rig]
-    write_text_model(tmp_path, rig, pictures, points=np.eye(3))
-    if binary:
-        write_binary(tmp_path)
+    (write_binary_model if binary else write_text_model)(tmp_path, rig, pictures, points=np.eye(3))
     sizes = dict.fromkeys(rig, (WIDTH, HEIGHT))
     files = sorted(tmp_path.glob("*.bin" if binary else "*.txt"))
     read = lambda: filmed_by(read_model(tmp_path), sizes, root=tmp_path)  # noqa: E731
     check_mutants(tmp_path, files, read, count=1000 if THOROUGH else 60)
-
-
-def write_binary(folder: Path) -> None:
-    """The model in ``folder`` as binary files in place of text."""
-    import struct
-
-    rows = {name: (folder / f"{name}.txt").read_text().splitlines() for name in ("cameras", "images", "points3D")}
-    lines = {name: [row for row in own if row and not row.startswith("#")] for name, own in rows.items()}
-    cameras, images = [line.split() for line in lines["cameras"]], [line.split() for line in lines["images"]]
-    images = [words for words in images if words[-1].endswith(".png")]
-    data = struct.pack("<Q", len(cameras))
-    for number, _, width, height, *params in cameras:
-        data += struct.pack("<iiQQ4d", int(number), 1, int(width), int(height), *map(float, params))
-    (folder / "cameras.bin").write_bytes(data)
-    data = struct.pack("<Q", len(images))
-    for words in images:
-        data += struct.pack("<i7di", int(words[0]), *map(float, words[1:8]), int(words[8]))
-        data += words[9].encode() + b"\0" + struct.pack("<Q", 0)
-    (folder / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(lines["points3D"]))
-    for number, line in enumerate(lines["points3D"]):
-        data += struct.pack("<Q3d3BdQ", number, *map(float, line.split()[1:4]), 0, 0, 0, 0.1, 0)
-    (folder / "points3D.bin").write_bytes(data)
 
 
 def write_prepared_folders(path: Path) -> None:

@@ -11,21 +11,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.cameras import Camera, rig_radius
+from structgstream.cameras import Camera
 from structgstream.data.calibration import (
     Alignment,
     PosedCamera,
     alignment,
     calibrated_camera,
-    calibrated_rig,
-    check_names,
     listed,
     rigid,
     rotation_matrix,
 )
 from structgstream.data.matching import project
-from structgstream.errors import CalibrationError, CaptureError
-from tests.support.captures import small_rig
+from structgstream.errors import CalibrationError
 from tests.support.properties import examples
 from tests.support.rigs import arc_rig
 
@@ -69,28 +66,6 @@ def test_a_principal_point_off_centre_is_accepted() -> None:
     assert camera(intrinsics=K + np.array([[0, 0, 14], [0, 0, -2], [0, 0, 0]])).K[0, 2] == 46
 
 
-def test_near_defaults_to_a_share_of_the_rig() -> None:
-    rig = small_rig()
-    found = calibrated_rig(rig.cameras, rig.held_out, where=WHERE)
-    assert found["cam01"].near == pytest.approx(0.12 * rig_radius(rig))
-    assert calibrated_rig(rig.cameras, rig.held_out, where=WHERE, near=0.5)["cam00"].near == 0.5
-
-
-def test_fewer_than_two_training_cameras_are_refused() -> None:
-    cameras = dict(list(small_rig().cameras.items())[:2])
-    with pytest.raises(CalibrationError, match=f"{WHERE}: .*at least two training cameras, got 1"):
-        calibrated_rig(cameras, ["cam00"], where=WHERE)
-
-
-def test_pictures_and_calibration_must_be_of_the_same_cameras() -> None:
-    folder = Path("take")
-    check_names(["a", "b"], ["b", "a"], calibration=WHERE, pictures=folder)
-    with pytest.raises(CalibrationError, match=r"pictures of camera 'c', for which .* no calibration"):
-        check_names(["a", "b"], ["a", "b", "c"], calibration=WHERE, pictures=folder)
-    with pytest.raises(CaptureError, match="calibrates cameras 'a', 'c', but take has no pictures"):
-        check_names(["a", "b", "c"], ["b"], calibration=WHERE, pictures=folder)
-
-
 def test_long_lists_are_cut() -> None:
     assert listed("abcdefg", limit=3) == "cameras 'a', 'b', 'c' and 4 more"
 
@@ -105,11 +80,6 @@ def test_a_rotation_vector_is_as_opencv_reads_it(vector: tuple[float, float, flo
     np.testing.assert_allclose(found, cv2.Rodrigues(np.array(vector))[0], atol=1e-9)
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0)
-
-
-def test_no_rotation_is_the_identity() -> None:
-    assert (rotation_matrix(np.zeros(3)) == np.eye(3)).all()
-    assert (rotation_matrix(np.full(3, 1e-13)) == np.eye(3)).all()
 
 
 @given(VECTOR, VECTOR)

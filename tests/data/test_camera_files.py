@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.data.camera_files import REPORT, by_stem, files_of, other_roots, pictures_in, videos_in
+from structgstream.data.camera_files import REPORT, videos_in
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
 from tests.support.captures import (
@@ -31,34 +31,7 @@ def test_videos_in_folders_of_cameras(tmp_path: Path) -> None:
     assert videos_in(tmp_path) == {"middle": tmp_path / "middle.mp4"}
 
 
-@pytest.mark.parametrize("inside", ["", "images/", "data/"])
-def test_pictures_in_folders(tmp_path: Path, inside: str) -> None:
-    write_picture(tmp_path / f"cam0/{inside}7.png", picture(0, 0))
-    write_picture(tmp_path / f"masks/cam0/{inside}7.png", picture(0, 0))
-    assert pictures_in(tmp_path) == {"cam0": {"7": tmp_path / f"cam0/{inside}7.png"}}
-
-
-def test_one_take_is_found_and_several_are_asked_about(tmp_path: Path) -> None:
-    assert list(other_roots(tmp_path)) == []
-    write_videos(tmp_path / "recordings/walk", ["a", "b"], frames=2)
-    assert list(other_roots(tmp_path)) == [tmp_path / "recordings/walk"]
-    write_videos(tmp_path / "run", ["a", "b"], frames=2)
-    with pytest.raises(CaptureError, match=r"in several folders \(run, recordings/walk\); .*Give the folder"):
-        list(other_roots(tmp_path))
-
-
 APPLE_DOUBLE = b"\0\5\x16\7"
-
-
-def test_files_of_a_kind_are_sorted_and_hidden_ones_are_none(tmp_path: Path) -> None:
-    for name in ("b.JPG", "a.jpg", "._a.jpg", "c.txt"):
-        (tmp_path / name).write_bytes(b"")
-    assert [file.name for file in files_of(tmp_path, (".jpg",))] == ["a.jpg", "b.JPG"]
-
-
-def test_two_files_of_one_name_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"a\.jpg and a\.png in .* are of one name, 'a'; expected one file of each"):
-        by_stem([tmp_path / "a.jpg", tmp_path / "a.png"])
 
 
 def colmap(where: Path) -> None:

@@ -9,33 +9,11 @@ import pytest
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError
-from tests.support.captures import quaternion, small_rig, write_text_model
+from tests.support.captures import quaternion, small_rig, write_binary_model, write_text_model
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 7.0]])
 RIG = small_rig(3)
 IMAGES = [(f"{name} left/000000.png", name) for name in reversed(list(RIG))]  # a space in every name
-
-
-def write_binary_model(folder: Path) -> None:
-    """The model of RIG, IMAGES and POINTS in the binary format; camera 2 is a SIMPLE_PINHOLE."""
-    folder.mkdir(parents=True)
-    cameras = struct.pack("<Q", len(RIG))
-    for number, camera in enumerate(RIG.cameras.values(), start=1):
-        fx, fy, cx, cy = (float(camera.K[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        params = (fx, cx, cy) if number == 2 else (fx, fy, cx, cy)
-        cameras += struct.pack(f"<iiQQ{len(params)}d", number, number != 2, camera.width, camera.height, *params)
-    images = struct.pack("<Q", len(IMAGES))
-    ids = {name: number for number, name in enumerate(RIG, start=1)}
-    for number, (file, name) in enumerate(IMAGES, start=1):
-        pose = (*quaternion(RIG[name]), *RIG[name].viewmat[:3, 3].tolist())
-        images += struct.pack("<i7di", number, *pose, ids[name]) + file.encode() + b"\0"
-        images += struct.pack("<Q", number) + struct.pack("<ddq", 1.5, 2.5, -1) * number
-    points = struct.pack("<Q", len(POINTS))
-    for number, point in enumerate(POINTS):
-        points += struct.pack("<Q3d3BdQ", number, *point, 9, 9, 9, 0.5, number) + struct.pack("<ii", 1, 0) * number
-    (folder / "cameras.bin").write_bytes(cameras)
-    (folder / "images.bin").write_bytes(images)
-    (folder / "points3D.bin").write_bytes(points)
 
 
 @pytest.fixture(params=["text", "binary"])
@@ -43,7 +21,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "text":
         write_text_model(tmp_path / "sparse", RIG, IMAGES, points=POINTS)
     else:
-        write_binary_model(tmp_path / "sparse")
+        write_binary_model(tmp_path / "sparse", RIG, IMAGES, points=POINTS)
     return tmp_path / "sparse"
 
 
@@ -67,7 +45,7 @@ def test_points_are_optional(folder: Path) -> None:
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
 def test_a_cut_file_is_named_by_its_folder(tmp_path: Path, stem: str) -> None:
-    write_binary_model(tmp_path / "sparse")
+    write_binary_model(tmp_path / "sparse", RIG, IMAGES, points=POINTS)
     file = tmp_path / "sparse" / f"{stem}.bin"
     file.write_bytes(file.read_bytes()[:-9])
     with pytest.raises(CalibrationError, match=f"COLMAP model in {tmp_path / 'sparse'} cannot be read"):

@@ -12,10 +12,9 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from structgstream.data.images import ImageSource, StatedOptics, common_pictures, picture_size, read_exif
+from structgstream.data.images import ImageSource, StatedOptics, picture_size, read_exif
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 from tests.support.captures import all_numbers, picture, small_rig, write_picture
-from tests.support.drawn import pixels_of
 
 
 @pytest.fixture
@@ -37,27 +36,11 @@ def test_frames_come_in_order_with_time_and_every_camera(source: ImageSource) ->
     assert frames[0].images["cam00"].dtype == np.uint8
 
 
-def test_frames_start_anywhere_and_again(source: ImageSource) -> None:
-    assert [frame.index for frame in source.frames(3)] == [3, 4]
-    assert all_numbers(source.frames(3)) == all_numbers(list(source.frames())[3:])
-    assert list(source.frames(5)) == []
-
-
 def test_channels_are_red_green_blue(source: ImageSource, tmp_path: Path) -> None:
     orange = np.full((48, 64, 3), (250, 120, 10), np.uint8)
     write_picture(tmp_path / "cam00" / "0.jpg", orange)
     image = next(source.frames()).images["cam00"]
     np.testing.assert_allclose(image.mean(axis=(0, 1)), (250, 120, 10), atol=3)
-
-
-def test_an_orientation_tag_does_not_turn_the_calibrated_pixels(source: ImageSource, tmp_path: Path) -> None:
-    path = tmp_path / "cam00" / "0.jpg"
-    data = path.read_bytes()
-    turned = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # TIFF: orientation 6
-    exif = b"Exif\0\0" + turned
-    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
-    assert pixels_of(path).shape == (64, 48, 3)
-    assert next(source.frames()).images["cam00"].shape == (48, 64, 3)
 
 
 def test_a_picture_of_another_size_names_file_and_sizes(source: ImageSource, tmp_path: Path) -> None:
@@ -86,19 +69,6 @@ def test_the_extra_is_named_when_opencv_is_absent(source: ImageSource, monkeypat
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
         next(source.frames())
-
-
-def test_pictures_are_matched_by_name_not_by_count() -> None:
-    files = {
-        "a": {name: Path(f"a/{name}.png") for name in ("8", "9", "10")},
-        "b": {name: Path(f"b/{name}.png") for name in ("9", "10", "11")},
-    }
-    common, instants = common_pictures(files, where=Path("take"))
-    assert instants == ("9", "10")
-    assert common == {name: (Path(f"{name}/9.png"), Path(f"{name}/10.png")) for name in "ab"}
-    del files["a"]["9"]
-    common, instants = common_pictures({**files, "b": {**files["b"], "8": Path("b/8.png")}}, where=Path("take"))
-    assert common["a"] == (Path("a/8.png"), None, Path("a/10.png"))
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "webp", "tif"])

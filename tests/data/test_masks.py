@@ -19,11 +19,11 @@ from structgstream.data.source import every_nth_frame
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import Undistortion, rectilinear, undistort
 from structgstream.errors import CaptureError
-from tests.data.test_transforms_capture import edit
 from tests.data.test_transforms_capture import write as write_transforms
 from tests.support.captures import (
     HEIGHT,
     WIDTH,
+    edit_json,
     picture,
     small_rig,
     write_clip,
@@ -97,7 +97,7 @@ def test_masks_are_named_as_the_camera_s_own_pictures(tmp_path: Path, pattern: s
     """Not by their times, nor as those of a camera with other padding; pictures of one name are of their folders."""
     write_transforms(tmp_path, pattern, w=WIDTH, h=HEIGHT)
     if not timed:
-        edit(tmp_path / "transforms.json", lambda content: [frame.pop("time") for frame in content["frames"]])
+        edit_json(tmp_path / "transforms.json", lambda content: [frame.pop("time") for frame in content["frames"]])
         for file in (tmp_path / "images/cam02").glob("*.png"):
             file.rename(file.with_stem(f"00{file.stem}"))
     write_mask(tmp_path / "masks/cam00/0001.png", left_half())

@@ -5,11 +5,9 @@ Matches of pairs of pictures, of a picture and the same one moved.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from structgstream import cameras
@@ -24,7 +22,6 @@ from structgstream.data.matching import (
     fundamental_matrix,
     guided_matches,
     inside,
-    level_normal,
     mutual_matches,
     neighbor_views,
     project,
@@ -108,21 +105,6 @@ def test_texture_that_repeats_along_the_line_is_not_matched() -> None:
     assert matched(there) == 1
     assert matched(np.concatenate([there, there + 0.5])) == 1
     assert matched(np.concatenate([there, apart])) == 0
-
-
-def test_cameras_that_do_not_converge_fall_back_on_their_spread() -> None:
-    cameras = {f"cam{i}": replace(room_rig()["cam02"], viewmat=shifted(i)) for i in range(5)}
-    assert viewing_distance(cameras) == pytest.approx(5 * 2.0)
-
-
-def shifted(steps: int) -> torch.Tensor:
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[0, 3] = -float(steps)
-    return viewmat
-
-
-def test_level_is_square_to_the_horizontal_axes_even_for_cameras_that_look_down() -> None:
-    np.testing.assert_allclose(level_normal(dict(arc_rig(5).cameras)), [0, -1, 0], atol=1e-6)
 
 
 Descriptors = NDArray[np.float32]

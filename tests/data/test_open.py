@@ -14,7 +14,6 @@ from tests.support.captures import (
     picture,
     small_rig,
     write_clip,
-    write_meet_room,
     write_n3dv,
     write_panoptic,
     write_picture,
@@ -38,7 +37,6 @@ WRITERS = [
     write_clip,
     write_shared_intrinsics,
     write_n3dv,
-    write_meet_room,
     write_colmap,
 ]
 

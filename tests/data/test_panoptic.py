@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +7,7 @@ import torch
 
 from structgstream.data.dataset_layouts import PANOPTIC_FPS, TEST, TRAIN, open_panoptic
 from structgstream.errors import CalibrationError, CaptureError
-from tests.support.captures import all_numbers, write_panoptic
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+from tests.support.captures import all_numbers, edit_json, write_panoptic
 
 
 def test_cameras_poses_and_pictures(tmp_path: Path) -> None:
@@ -43,7 +35,7 @@ def test_a_camera_that_moves_is_refused(tmp_path: Path, key: str) -> None:
     def move(content: dict[str, Any]) -> None:
         content[key][3][1][0][2] += 0.01
 
-    edit(tmp_path / TRAIN, move)
+    edit_json(tmp_path / TRAIN, move)
     with pytest.raises(CalibrationError, match=r"'2' .*moves: its k or w2c changes at 2/000093\.jpg"):
         open_panoptic(tmp_path)
 
@@ -68,7 +60,7 @@ def test_a_camera_whose_folder_is_missing_is_named(tmp_path: Path) -> None:
 def test_size_of_the_metadata_must_be_the_pictures(tmp_path: Path) -> None:
     write_panoptic(tmp_path)
     for meta in (TRAIN, TEST):
-        edit(tmp_path / meta, lambda content: content.update(w=72, h=54))
+        edit_json(tmp_path / meta, lambda content: content.update(w=72, h=54))
     with pytest.raises(CalibrationError, match=r"64x48 pixels, .* 72x54"):
         next(open_panoptic(tmp_path).frames())
 

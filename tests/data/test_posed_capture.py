@@ -12,7 +12,7 @@ import pytest
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import RadialTangential
 from structgstream.data.posed_capture import filmed_by, open_posed
-from structgstream.errors import CalibrationError, ConfigError
+from structgstream.errors import CalibrationError
 from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_picture
 
 LENS = RadialTangential(k1=-0.1)
@@ -71,7 +71,7 @@ def test_names_that_do_not_fit_are_not_guessed(names: tuple[str, ...], files: tu
 
 def test_a_camera_without_calibration_is_named() -> None:
     sizes: dict[str, tuple[int, int]] = dict.fromkeys(("cam0", "cam1", "cam2", "extra"), (WIDTH, HEIGHT))
-    with pytest.raises(CalibrationError, match="extra"):
+    with pytest.raises(CalibrationError, match=r"pictures of camera 'extra', for which rig\.json has no calibration"):
         filmed_by(calibration(("cam0", "cam1", "cam2")), sizes, root=ROOT)
 
 
@@ -137,12 +137,6 @@ def written(folder: Path) -> Path:
     for number, name in enumerate(("left", "middle", "right")):
         write_picture(folder / "images" / name / "0000.png", picture(number, 0))
     return folder
-
-
-@pytest.mark.parametrize("fps", [0.0, -30.0, float("nan"), float("inf")])
-def test_a_rate_that_is_none(tmp_path: Path, fps: float) -> None:
-    with pytest.raises(ConfigError, match=f"Frames a second must be positive, got {fps:g}"):
-        open_posed(written(tmp_path), calibration(("left", "middle", "right")), fps=fps)
 
 
 def test_cameras_are_held_out_by_their_name_in_the_calibration(tmp_path: Path) -> None:

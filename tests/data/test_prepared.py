@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +27,7 @@ from tests.support.captures import (
     HEIGHT,
     WIDTH,
     all_numbers,
-    numbers,
+    edit_json,
     picture,
     small_rig,
     write_picture,
@@ -47,12 +46,6 @@ def content(
         filmed = LensCamera(camera, lens)
         cameras[name] = PreparedCamera(f"{folder}/{name}{suffix}", filmed, rectilinear(filmed))
     return PreparedCapture(cameras, 30.0, 0.25, "metres", frozenset({"cam01"}))
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    values = json.loads((path / FILE).read_text())
-    change(values)
-    (path / FILE).write_text(json.dumps(values))
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -82,34 +75,6 @@ def test_a_camera_to_hold_out_that_there_is_none_of(tmp_path: Path) -> None:
         read_prepared(tmp_path)
 
 
-def test_tone_curves_of_earlier_versions_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    wanted = content()
-    write_prepared(tmp_path, wanted)
-    stored = json.loads((tmp_path / FILE).read_text())
-    for number, camera in enumerate(stored["cameras"].values()):
-        camera["tone"] = [[0.1 * step for step in range(8)]] * 3 if number == 0 else None
-    (tmp_path / FILE).write_text(json.dumps(stored))
-    assert [*read_prepared(tmp_path).cameras] == [*wanted.cameras]
-    assert "has tone curves, which are not applied any more" in caplog.text
-
-
-def test_videos_are_opened_in_step(tmp_path: Path) -> None:
-    """Camera 2 started two frames late by its own clock, which counts from its own start."""
-    capture = content()
-    write_videos(tmp_path / "videos", list(capture.cameras), frames=6)
-    cameras = dict(capture.cameras)
-    cameras["cam02"] = replace(cameras["cam02"], clock=Clock(-2 / 30))
-    write_prepared(tmp_path, replace(capture, cameras=cameras, held_out=frozenset()))
-    source = open_capture(tmp_path)
-    frames = {frame.index: frame for frame in source.frames(0)}
-    together = [frame for frame in frames.values() if len(frame.images) == 4]
-    for frame in together:
-        carried = {name: numbers(image)[1] for name, image in frame.images.items()}
-        assert carried["cam02"] == carried["cam00"] + 2
-    assert len(together) == 4
-    assert source.rig["cam00"].near == 0.25
-
-
 def test_lenses_are_undistorted_to_the_stated_pinhole(tmp_path: Path) -> None:
     capture = content(lenses=(RadialTangential(k1=-0.1),) * 4)
     capture = replace(
@@ -128,23 +93,6 @@ def test_lenses_are_undistorted_to_the_stated_pinhole(tmp_path: Path) -> None:
     assert source.rig.testing == ("cam01",)
 
 
-def test_folders_of_pictures(tmp_path: Path) -> None:
-    capture = content(folder="pictures", suffix="")
-    for number, name in enumerate(capture.cameras):
-        for frame in range(5):
-            write_picture(tmp_path / "pictures" / name / f"{frame:03d}.png", picture(number, frame))
-    cameras = dict(capture.cameras)
-    cameras["cam01"] = replace(cameras["cam01"], clock=Clock(1.3 / 30))
-    write_prepared(tmp_path, replace(capture, cameras=cameras))
-    source = open_capture(tmp_path)
-    assert len(source) == 4
-    apart = apart_seconds(source)
-    assert {name: list(own) for name, own in apart.items()} == {
-        name: pytest.approx([0.3 / 30 if name == "cam01" else 0.0] * 4) for name in cameras
-    }
-    assert all_numbers(source.frames(0))[0] == [(0, 1), (1, 0), (2, 1), (3, 1)]
-
-
 @pytest.mark.parametrize("folder", ["videos", "pictures"])
 def test_pictures_and_videos_are_paired_alike(tmp_path: Path, folder: str) -> None:
     """Four cameras of one trigger whose times lie around half a period, and one of them is slower by a tenth."""
@@ -161,6 +109,7 @@ def test_pictures_and_videos_are_paired_alike(tmp_path: Path, folder: str) -> No
         write_videos(tmp_path / folder, list(cameras), frames=12)
     write_prepared(tmp_path, replace(capture, cameras=cameras, held_out=frozenset()))
     source = open_capture(tmp_path)
+    assert source.rig["cam00"].near == 0.25
     paired = [[frame for _, frame in own] for own in all_numbers(source.frames(0))]
     assert paired == [[n] * 4 for n in range(6)] + [[6] * 3] + [[n, n, n, n - 1] for n in range(7, 12)]
     apart = apart_seconds(source)
@@ -181,7 +130,7 @@ def test_points_come_along_unless_another_camera_is_held_out(tmp_path: Path) -> 
 
 def test_a_later_version_is_refused(tmp_path: Path) -> None:
     write_prepared(tmp_path, content())
-    edit(tmp_path, lambda values: values.update(version=2))
+    edit_json(tmp_path / FILE, lambda values: values.update(version=2))
     with pytest.raises(CalibrationError, match=r"version 2; this program reads .*version 1: prepare the capture again"):
         read_prepared(tmp_path)
 
@@ -214,7 +163,7 @@ def test_broken_content_names_its_camera(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], reported: str
 ) -> None:
     write_prepared(tmp_path, content())
-    edit(tmp_path, change)
+    edit_json(tmp_path / FILE, change)
     with pytest.raises(CalibrationError, match=reported):
         read_prepared(tmp_path)
 

@@ -251,7 +251,9 @@ def test_numbers_are_instants_whatever_their_padding_and_prefix(stem: Callable[[
     assert slots["00_00"].tolist() == [0, 1, 2, 3]
     assert slots["00_02"].tolist() == [1, 2, 3, 4]
     common, _ = common_pictures(
-        {name: {file.stem: file for file in files} for name, files in pictures.items()}, where=Path("take")
+        {name: {file.stem: file for file in files} for name, files in pictures.items()},
+        where=Path("take"),
+        training=pictures,
     )
     assert len(common["00_00"]) == 4 or len(common["00_00"]) == 3
     assert common["00_00"][0] == pictures["00_00"][1]
@@ -262,7 +264,9 @@ def test_numbers_of_other_names_are_reported_and_names_that_share_nothing_refuse
 ) -> None:
     def common(**stems: str) -> None:
         common_pictures(
-            {name: {stem: Path(stem) for stem in own.split()} for name, own in stems.items()}, where=tmp_path
+            {name: {stem: Path(stem) for stem in own.split()} for name, own in stems.items()},
+            where=tmp_path,
+            training=stems,
         )
 
     common(a="a_1 a_2", b="b_1 b_2")  # each has its camera's name

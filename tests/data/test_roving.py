@@ -25,10 +25,10 @@ from structgstream.data.roving import (
     passes_through,
     roving_of,
 )
-from structgstream.data.source import Prefetch, resized
+from structgstream.data.source import FrameStream, Prefetch, resized
 from structgstream.data.undistortion import Undistortion, rectilinear
 from structgstream.errors import CaptureError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import MultiViewFrame, RovingPicture
 from tests.support.captures import HEIGHT, WIDTH, small_rig, write_picture
 from tests.support.rigs import arc_rig, look_at
 
@@ -130,16 +130,21 @@ def write_capture(folder: Path) -> PreparedCapture:
     return content
 
 
+def roving_pictures(source: FrameStream) -> tuple[RovingPicture, ...]:
+    """Those for the first frame."""
+    roving = roving_of(source)
+    assert roving is not None
+    return roving.roving(next(source.frames()))
+
+
 def test_a_capture_has_its_roving_pictures(tmp_path: Path) -> None:
     content = write_capture(tmp_path)
     found = read_prepared(tmp_path)
     assert prepared_entries(found) == prepared_entries(content)
     source = open_capture(tmp_path, start=1, frames=2)
     assert [*source.rig] == [*small_rig()]
-    roving = roving_of(Prefetch(source))
-    assert roving is not None
     frame = next(source.frames())
-    pictures = roving.roving(frame)
+    pictures = roving_pictures(Prefetch(source))
     assert [int(np.median(own.image)) for own in pictures] == [100, 101]
     assert [own.camera.width for own in pictures] == [WIDTH, WIDTH]
     assert pictures[0].camera.near == pytest.approx(0.25 * 0.25)
@@ -177,9 +182,7 @@ def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull_if_these
 def test_roving_pictures_are_reduced_as_the_capture_is(tmp_path: Path) -> None:
     write_capture(tmp_path)
     for source in (open_capture(tmp_path, scale=0.5), resized(open_capture(tmp_path), 0.5)):
-        roving = roving_of(source)
-        assert roving is not None
-        (one, _) = roving.roving(next(source.frames()))
+        one, _ = roving_pictures(source)
         assert one.image.shape == (HEIGHT // 2, WIDTH // 2, 3)
         assert (one.camera.height, one.camera.width) == one.mask.shape
 
@@ -194,9 +197,7 @@ def test_roving_pictures_are_no_larger_than_those_of_the_cameras(tmp_path: Path)
     write_prepared(tmp_path, replace(content, roving=larger))
     for scale in (1.0, 0.5):
         source = open_capture(tmp_path, scale=scale)
-        roving = roving_of(source)
-        assert roving is not None
-        for own in roving.roving(next(source.frames())):
+        for own in roving_pictures(source):
             assert own.image.shape == (HEIGHT * scale, WIDTH * scale, 3)
             assert (own.camera.width, own.camera.height) == (WIDTH * scale, HEIGHT * scale)
 
@@ -210,10 +211,7 @@ def test_the_lens_of_all_roving_pictures_is_computed_once(tmp_path: Path, monkey
         return Undistortion(*own)
 
     monkeypatch.setattr(roving_module, "Undistortion", counted)
-    source = open_capture(tmp_path)
-    roving = roving_of(source)
-    assert roving is not None
-    first, second = roving.roving(next(source.frames()))
+    first, second = roving_pictures(open_capture(tmp_path))
     assert len(made) == 1
     assert first.image.shape == second.image.shape
 
@@ -257,8 +255,5 @@ def test_a_roving_picture_that_lacks_is_named(tmp_path: Path) -> None:
 def test_a_roving_picture_of_another_size_is_named(tmp_path: Path) -> None:
     write_capture(tmp_path)
     write_picture(tmp_path / "roving/000001.png", np.zeros((HEIGHT // 2, WIDTH, 3), np.uint8))
-    source = open_capture(tmp_path)
-    roving = roving_of(source)
-    assert roving is not None
     with pytest.raises(CaptureError, match=r"000001.png has 64x24 pixels, expected 64x48"):
-        roving.roving(next(source.frames()))
+        roving_pictures(open_capture(tmp_path))

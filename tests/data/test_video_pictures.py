@@ -12,7 +12,6 @@ from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CaptureError
 from tests.support.captures import HEIGHT, WIDTH, numbers, picture, write_video
 
-SIZE = (WIDTH, HEIGHT)
 FRAMES = 16  # in groups of four
 Damages = list[tuple[int, int | None, str]]
 
@@ -27,9 +26,9 @@ def track_of(folder: Path, *, noisy: bool = False) -> VideoTrack:
     return scan_videos({"a": folder / "a.mp4"})["a"]
 
 
-def read(track: VideoTrack, stamps: list[int | None], *, size: tuple[int, int] = SIZE) -> tuple[list, Damages]:
+def read(track: VideoTrack, stamps: list[int | None]) -> tuple[list, Damages]:
     damages: Damages = []
-    shown = pictures_at(track, stamps, size=size, on_damage=lambda *reported: damages.append(reported))
+    shown = pictures_at(track, stamps, size=(WIDTH, HEIGHT), on_damage=lambda *reported: damages.append(reported))
     found = [None if one is None else one[0] for one in shown]
     return found, damages
 
@@ -49,18 +48,6 @@ def test_where_nothing_is_wanted_there_is_no_picture(tmp_path: Path) -> None:
     assert [numbers(image) for image in found if image is not None] == [(3, 4), (3, 6)]
     gone = replace(track, path=tmp_path / "gone.mp4")
     assert read(gone, [None, None]) == ([None, None], [])  # not even opened
-
-
-def test_pictures_have_the_size_that_is_asked_for(tmp_path: Path) -> None:
-    track = track_of(tmp_path)
-    (half,), _ = read(track, [track.stamps[9]], size=(WIDTH // 2, HEIGHT // 2))
-    assert half.shape == (HEIGHT // 2, WIDTH // 2, 3)
-    assert numbers(half) == (3, 9)
-    (turned,), _ = read(
-        replace(track, quarter_turns=1, width=HEIGHT, height=WIDTH), [track.stamps[9]], size=(HEIGHT, WIDTH)
-    )
-    assert turned.shape == (WIDTH, HEIGHT, 3)
-    assert numbers(np.ascontiguousarray(np.rot90(turned, -1))) == (3, 9)
 
 
 def test_a_video_whose_size_changes_is_refused_where_it_does(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 """Writes tiny captures in every layout; each picture carries its camera's and its frame's number."""
 
 import json
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import av
 import cv2
@@ -120,6 +122,13 @@ def write_picture(path: Path, image: Picture) -> None:
     """A picture file, with quality enough for its numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def edit_json(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Changes the content of a JSON file."""
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
 
 
 def small_rig(cameras: int = 4) -> CameraRig:
@@ -274,3 +283,27 @@ def write_text_model(
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     rows = [f"{i} {x} {y} {z} 9 9 9 0.5 1 0 2 0" for i, (x, y, z) in enumerate(points if points is not None else [])]
     (folder / "points3D.txt").write_text("\n".join(["# points", *rows]) + "\n")
+
+
+def write_binary_model(
+    folder: Path, rig: CameraRig, images: Sequence[tuple[str, str]], *, points: NDArray[np.float64]
+) -> None:
+    """As :func:`write_text_model`, in the binary format; camera 2 is a SIMPLE_PINHOLE."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = struct.pack("<Q", len(rig))
+    for number, camera in enumerate(rig.cameras.values(), start=1):
+        fx, fy, cx, cy = (float(camera.K[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        params = (fx, cx, cy) if number == 2 else (fx, fy, cx, cy)
+        cameras += struct.pack(f"<iiQQ{len(params)}d", number, number != 2, camera.width, camera.height, *params)
+    pictures = struct.pack("<Q", len(images))
+    ids = {name: number for number, name in enumerate(rig, start=1)}
+    for number, (file, name) in enumerate(images, start=1):
+        pose = (*quaternion(rig[name]), *rig[name].viewmat[:3, 3].tolist())
+        pictures += struct.pack("<i7di", number, *pose, ids[name]) + file.encode() + b"\0"
+        pictures += struct.pack("<Q", number) + struct.pack("<ddq", 1.5, 2.5, -1) * number
+    places = struct.pack("<Q", len(points))
+    for number, point in enumerate(points):
+        places += struct.pack("<Q3d3BdQ", number, *point, 9, 9, 9, 0.5, number) + struct.pack("<ii", 1, 0) * number
+    (folder / "cameras.bin").write_bytes(cameras)
+    (folder / "images.bin").write_bytes(pictures)
+    (folder / "points3D.bin").write_bytes(places)

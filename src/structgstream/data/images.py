@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.timeline import common_slots, instants_of, natural
-from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+from structgstream.errors import CalibrationError, CaptureError, MissingExtraError, import_extra
 from structgstream.frames import MultiViewFrame
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ PICTURE_SUFFIXES = frozenset({
     ".jpe", ".jp2", ".pgm", ".ppm",
 })  # fmt: skip
 HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
-TIFF_ORIENTATION = 0x0112  # the tag
+ORIENTATION = 0x0112  # the tag, in EXIF as in TIFF
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
 
@@ -92,15 +92,11 @@ class ImageSource:
 
 def opencv() -> ModuleType:
     """The module ``cv2``, from the extra ``capture``."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
-    return cv2
+    return import_extra("cv2", "capture")
 
 
 def common_pictures(
-    files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str] | None = None
+    files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str]
 ) -> tuple[dict[str, tuple[Path | None, ...]], tuple[str, ...]]:
     """The pictures of the time steps of a capture, of which cameras may lack some: by camera that of each step, None
     where it has none; and the names of the steps.
@@ -212,7 +208,7 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     except OSError as error:
         raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
-        data = _converted_heif(path, data)
+        return _heif_picture(path, data)
     if not data or is_cut_jpeg(data):
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
@@ -249,7 +245,7 @@ def _upright_tiff(data: bytes) -> bytes:
         (at,) = struct.unpack_from(f"{order}I", data, 4)
         (count,) = struct.unpack_from(f"{order}H", data, at)
         for entry in range(at + 2, at + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == TIFF_ORIENTATION:
+            if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
                 struct.pack_into(f"{order}H", changed, entry + 8, 1)
     except struct.error:
         return data  # cut, which the decoder notices
@@ -270,17 +266,16 @@ def is_cut_jpeg(data: bytes) -> bool:
     return data.find(b"\xff\xd9", at) < 0
 
 
-def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A HEIC or AVIF picture as PNG: HEIC is turned as it is shown, AVIF remains as it is stored."""
+def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
+    """The values of a HEIC or AVIF picture: HEIC is turned as it is shown, AVIF remains as it is stored."""
     is_avif = data[8:12] in (b"avif", b"avis")
     needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
-    missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")
     try:
         if is_avif:
             from PIL import Image, features
 
             if not features.check("avif"):
-                raise missing
+                raise ImportError
             image = Image.open(io.BytesIO(data))
         else:
             import pillow_heif  # pyright: ignore[reportMissingImports]
@@ -288,12 +283,12 @@ def _converted_heif(path: Path, data: bytes) -> bytes:
             image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
         pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
     except ImportError:
-        raise missing from None
-    except CaptureError:
-        raise
+        raise CaptureError(
+            f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG."
+        ) from None
     except Exception:  # a damaged one can raise anything
         raise _undecodable(path, data) from None
-    return bytes(opencv().imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])[1])
+    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
 def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
@@ -389,7 +384,7 @@ def _opened(path: Path) -> Iterator["ImageFile | None"]:
         yield picture
 
 
-ORIENTATION, EXIF_IFD = 0x0112, 0x8769
+EXIF_IFD = 0x8769
 FOCAL_LENGTH, FOCAL_35MM = 0x920A, 0xA405
 PLANE_RESOLUTION, PLANE_UNIT, PIXELS_ACROSS, PIXELS_DOWN = 0xA20E, 0xA210, 0xA002, 0xA003
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}

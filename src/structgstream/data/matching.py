@@ -73,12 +73,12 @@ def sift_features(
 
 
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
-    """Pixels ``[P, 2]`` and depths ``[P]`` of points ``[P, 3]``; pixels of points behind the camera are invalid."""
+    """Pixels ``[..., 2]`` and depths ``[...]`` of points ``[..., 3]``; pixels behind the camera are invalid."""
     viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depths = local[:, 2]
+    depths = local[..., 2]
     homogeneous = local @ K.T
-    return homogeneous[:, :2] / np.where(np.abs(depths) < 1e-12, 1e-12, depths)[:, None], depths
+    return homogeneous[..., :2] / np.where(np.abs(depths) < 1e-12, 1e-12, depths)[..., None], depths
 
 
 def back_project(camera: Camera, pixels: Floats, depths: Floats) -> Floats:
@@ -87,9 +87,9 @@ def back_project(camera: Camera, pixels: Floats, depths: Floats) -> Floats:
 
 
 def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> NDArray[np.bool_]:
-    """Which projections ``[P]`` fall into the picture, beyond ``near``."""
+    """Which projections ``[...]`` fall into the picture, beyond ``near``."""
     size = (camera.width, camera.height)
-    return (depths > near) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    return (depths > near) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
 
 
 def viewing_distance(cameras: Mapping[str, Camera]) -> float:
@@ -287,6 +287,12 @@ def distinct_best(
 def rays(camera: Camera, pixels: Floats) -> Floats:
     """World directions ``[P, 3]`` through pixels, of length one along the camera's z."""
     return _homogeneous(pixels) @ np.linalg.inv(camera.K.numpy()).T @ camera.viewmat.numpy()[:3, :3]
+
+
+def rays_of_pixels(camera: Camera) -> Floats:
+    """Directions ``[H, W, 3]`` through the pixel centres in the camera's own axes, of length one along z."""
+    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([column, row, np.ones_like(column)], -1) @ np.linalg.inv(camera.K.numpy()).T
 
 
 def _homogeneous(pixels: Floats) -> Floats:

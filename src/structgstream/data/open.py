@@ -22,7 +22,7 @@ is at half of ``reach(u)``, the least ``d / cos(a - u)``. Three departures make 
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -31,7 +31,7 @@ import numpy as np
 
 from structgstream.cameras import CameraRig
 from structgstream.data import transforms
-from structgstream.data.calibration import Calibration, PosedCamera, with_near
+from structgstream.data.calibration import Calibration, alignment, with_near
 from structgstream.data.calibration_files import tools
 from structgstream.data.calibration_files.opencv_cameras import OPENCV_CAMERAS
 from structgstream.data.camera_files import (
@@ -177,22 +177,16 @@ def _agree(a: Calibration, b: Calibration) -> bool:
     first, second = ({camera.name: camera for camera in own.cameras} for own in (a, b))
     if first.keys() != second.keys():
         return False
-    names = sorted(first)
-    rotations, offsets = zip(*(_relative([own[name] for name in names]) for own in (first, second)))
-    K = [np.array([own[name].K for name in names]) for own in (first, second)]
-    return bool(
-        np.abs(rotations[0] - rotations[1]).max() < SAME_ROTATION
-        and np.abs(offsets[0] - offsets[1]).max() < SAME_SHARE
-        and np.abs(K[0] - K[1]).max() < SAME_PIXELS
+    poses = [{name: camera.viewmat for name, camera in own.items()} for own in (first, second)]
+    fitted = alignment(*poses)
+    pairs = [(camera, second[name]) for name, camera in first.items()]
+    extent = float(np.linalg.norm(np.ptp([other.center for _, other in pairs], axis=0))) or 1.0
+    return all(
+        np.abs(camera.viewmat[:3, :3] @ fitted.rotation.T - other.viewmat[:3, :3]).max() < SAME_ROTATION
+        and np.abs(fitted.points(camera.center) - other.center).max() < SAME_SHARE * extent
+        and np.abs(camera.K - other.K).max() < SAME_PIXELS
+        for camera, other in pairs
     )
-
-
-def _relative(cameras: Sequence[PosedCamera]) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations ``[V, 3, 3]`` and positions ``[V, 3]`` in the axes of the first camera, in extents of the rig."""
-    first = cameras[0].viewmat[:3, :3]
-    centers = np.array([camera.center for camera in cameras])
-    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) or 1.0
-    return np.array([camera.viewmat[:3, :3] @ first.T for camera in cameras]), (centers - centers[0]) @ first.T / extent
 
 
 LAYOUTS_HELP = """Supported layouts:

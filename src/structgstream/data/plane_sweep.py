@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.images import opencv, reduced_mask
-from structgstream.data.matching import back_project, inside, project
+from structgstream.data.matching import back_project, inside, project, rays_of_pixels
 from structgstream.geometry import Floats, Indices
 from structgstream.kernels.backend import processor_backend
 
@@ -254,7 +254,7 @@ def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, con
     if bounds.up is None or not config.level_planes:
         return families
     normal = camera.viewmat.numpy()[:3, :3] @ bounds.up
-    slant = np.abs(_rays_of_pixels(camera) @ normal).max()
+    slant = np.abs(rays_of_pixels(camera) @ normal).max()
     for height in bounds.heights:
         offset = height - float(bounds.up @ camera.center.numpy())
         # A plane near the lens' own height is seen edge on.
@@ -278,7 +278,7 @@ def _search(
     The plane is refined by a parabola through the scores around it.
     """
     offsets = family.inverse_offsets
-    tilt = _rays_of_pixels(reference.camera) @ family.normal
+    tilt = rays_of_pixels(reference.camera) @ family.normal
     cameras = [view.camera for view in neighbours]
     homographies = plane_homographies(reference.camera, cameras, offsets[:, None] * family.normal)
     own, others = torch.from_numpy(reference.grey), [torch.from_numpy(view.grey) for view in neighbours]
@@ -305,9 +305,3 @@ def _search(
     step = (offsets[-1] - offsets[0]) / last
     inverse = np.maximum(tilt * (offsets[0] + (best + shift) * step), 1e-12)
     return inverse, peak, np.where(interior, peak - rival, -1)
-
-
-def _rays_of_pixels(camera: Camera) -> Floats:
-    """Directions ``[H, W, 3]`` through the pixel centres in the camera's own axes, of length one along z."""
-    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return np.stack([column, row, np.ones_like(column)], -1) @ np.linalg.inv(camera.K.numpy()).T

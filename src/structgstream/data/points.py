@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig, enlargement
-from structgstream.data.images import opencv, reduced_mask
+from structgstream.data.images import reduced_mask, reduced_picture
 from structgstream.data.matching import (
     Features,
     Pair,
@@ -118,14 +118,9 @@ def _at_reference(
 
     Finer keypoints than these gain nothing for seeds, and cost 6 s a picture of 3840 x 2160.
     """
-    small, pictures, counting = dict(cameras), dict(images), dict(masks)
-    for name, camera in cameras.items():
-        if (by := enlargement(camera.width, camera.height)) > 1.0:
-            cv2, size = opencv(), (max(1, round(camera.width / by)), max(1, round(camera.height / by)))
-            small[name] = camera.resized(*size)
-            pictures[name] = np.asarray(cv2.resize(images[name], size, interpolation=cv2.INTER_AREA), np.uint8)
-            if name in masks:
-                counting[name] = reduced_mask(masks[name], size)
+    small = {name: camera.scaled(1 / enlargement(camera.width, camera.height)) for name, camera in cameras.items()}
+    pictures = {name: reduced_picture(images[name], max(own.width, own.height)) for name, own in small.items()}
+    counting = {name: reduced_mask(masks[name], pictures[name].shape[1::-1]) for name in small if name in masks}
     return small, pictures, counting
 
 

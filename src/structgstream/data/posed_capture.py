@@ -1,16 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures of pictures or videos with a calibration that names them: a COLMAP model, or a file of another tool.
 
-::
-
-    images/CAMERA/FRAME.ext     one folder per camera
-    frames/FRAME/CAMERA.ext     one folder per frame
-    CAMERA.mp4                  one video per camera, in the folder itself or in videos/
-    images/CAMERA.ext           one picture per camera: a capture of one frame
-
-and where else ``camera_files`` finds them. Which of the two layouts it is follows from the calibration: a
-camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was calibrated
-(``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
+They lie where ``camera_files`` finds them. Whether a folder of pictures is of a camera or of a frame follows from the
+calibration: a camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was
+calibrated (``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
 """
 
 import logging
@@ -54,7 +47,7 @@ from structgstream.data.images import (
 from structgstream.data.lenses import LensCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import path_parts
-from structgstream.data.timeline import check_rate, natural
+from structgstream.data.timeline import natural
 from structgstream.data.undistortion import rectilinear, undistort
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
@@ -88,7 +81,6 @@ def open_posed(
     Raises:
         CaptureError: no pictures or videos, or not of the calibrated cameras; or they cannot be read.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
-        ConfigError: a rate that is not positive.
     """
 
     def pictured(root: Path, files: Pictures, *, partial: bool) -> FrameSource:
@@ -96,8 +88,6 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
-    if fps is not None:
-        check_rate(fps)
     known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
     stills = [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
     for root in chain(filmed_roots(path), other_roots(path)):

@@ -7,7 +7,6 @@ calibrated again without touching what was filmed. A broken file is a ``Calibrat
 """
 
 import json
-import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, picture_siz
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, positive, read_array, read_json, readable
-from structgstream.data.timeline import Clock, common_slots, log_time_error, natural, origin_of, picture_slots, place
+from structgstream.data.timeline import Clock, natural, paired, picture_slots
 from structgstream.data.undistortion import undistorted_to
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
@@ -38,7 +37,6 @@ EXPECTED = "a capture that structgstream prepare wrote (docs/captures.md)"
 LENSES: Mapping[str, type[Lens]] = {"pinhole": Pinhole, "opencv": RadialTangential, "fisheye": Fisheye}
 
 Unit = Literal["metres", "arbitrary"]
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -116,8 +114,6 @@ def read_prepared(path: Path) -> PreparedCapture:
         if content["unit"] not in ("metres", "arbitrary"):
             raise Unreadable(f"unit {content['unit']!r}")
         cameras = {name: _read_camera(name, entry, file) for name, entry in entries.items()}
-        if any(entry.get("tone") for entry in entries.values()):
-            _log.warning("%s has tone curves, which are not applied any more; pictures are read as filmed.", file)
         check_held_out(content["held_out"], cameras, where=file)
         return PreparedCapture(
             cameras=cameras,
@@ -182,27 +178,21 @@ def _of_folders(
     found = {name: pictures_of(folder) for name, folder in files.items()}
     if empty := [name for name, pictures in found.items() if not pictures]:
         raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
-    positions = {
-        name: capture.cameras[name].clock.common_seconds(own / capture.fps) * capture.fps
+    seconds = {
+        name: capture.cameras[name].clock.common_seconds(own / capture.fps)
         for name, own in picture_slots(found).items()
     }
-    origin = origin_of(list(positions.values()))
-    placed = {name: place(own - origin) for name, own in positions.items()}
-    slots = {name: own.slots.tolist() for name, own in placed.items()}
-    common = common_slots(slots, where=str(path), label=lambda slot: f"instant {slot}", training=rig.training)
-    log_time_error(placed, common, fps=capture.fps, where=str(path))
-    cut, errors = {}, {}
+    frames, apart = paired(seconds, fps=capture.fps, where=str(path), training=rig.training)
+    cut = {}
     for name, pictures in found.items():
-        frames, apart = placed[name].within(common)
-        cut[name] = tuple(None if frame is None else pictures[frame] for frame in frames)
-        errors[name] = apart / capture.fps
+        cut[name] = tuple(None if frame is None else pictures[frame] for frame in frames[name])
         size, own = picture_size(pictures[0]), (rig[name].width, rig[name].height)
         if size != own:
             raise CalibrationError(
                 f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
-    return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=errors)
+    return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=apart)
 
 
 def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.images import opencv, read_picture, reduced_mask
+from structgstream.data.images import opencv, read_picture, reduced_mask, reduced_picture
+from structgstream.data.matching import inside, project, rays_of_pixels
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.prepared import ROVING, PreparedCamera, PreparedCapture
 from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, closed, resized_to
@@ -111,7 +112,7 @@ class WithRoving(SourceWrapper):
         if len(self.whole) < MIN_INSTANTS:
             return {}
         return {
-            name: differs(reduced(frame.images[name]), self._still[name])
+            name: differs(reduced_picture(frame.images[name], REDUCED_SIDE), self._still[name])
             for name in self.rig.training
             if name in frame.images and name in self._still
         }
@@ -126,7 +127,7 @@ class WithRoving(SourceWrapper):
                 shown = next(frames, None)
             images = {} if shown is None else shown.images
             for name in seen.keys() & images.keys():
-                seen[name].append(reduced(images[name]))
+                seen[name].append(reduced_picture(images[name], REDUCED_SIDE))
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
@@ -184,14 +185,6 @@ def joined(
     return replace(frame, images=images, masks=masks), CameraRig(cameras, rig.held_out)
 
 
-def reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture ``[H, W, 3]`` at the size at which changes are looked for."""
-    height, width = picture.shape[:2]
-    factor = min(1.0, REDUCED_SIDE / max(width, height))
-    size = max(round(width * factor), 1), max(round(height * factor), 1)
-    return np.asarray(opencv().resize(picture, size, interpolation=opencv().INTER_AREA), np.uint8)
-
-
 def most_frequent(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Of each pixel of ``[T, H, W, 3]`` the one that differs from the fewest others.
 
@@ -216,19 +209,12 @@ def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray
     small = camera.scaled(min(1.0, REDUCED_SIDE / max(camera.width, camera.height)))
     found = np.zeros((small.height, small.width), bool)
     if changed:
-        eye, rays = _rays(small)
+        eye, rays = small.center.numpy(), rays_of_pixels(small) @ small.viewmat[:3, :3].numpy()
         for depth in _depths(eye, small.near, rig, changed):
             found |= moving_places(eye + depth * rays, rig, changed)
     # Its pixels are areas of the picture's.
     whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)
     return np.asarray(whole, bool)
-
-
-def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """Centre ``[3]`` of ``camera``, and for each pixel ``[H, W, 3]`` the way from it to depth 1."""
-    across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(camera.K.numpy()).T
-    return camera.center.numpy(), flat @ camera.viewmat[:3, :3].numpy()
 
 
 def _depths(eye: Floats, near: float, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Floats:
@@ -243,8 +229,7 @@ def hull_points(rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Flo
     found = [np.zeros((0, 3))]
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
-        eye, rays = _rays(camera)
-        rays = rays[mask]
+        eye, rays = camera.center.numpy(), (rays_of_pixels(camera) @ camera.viewmat[:3, :3].numpy())[mask]
         for depth in _depths(eye, camera.near, rig, changed):
             places = eye + depth * rays
             moving = moving_places(places, rig, changed)
@@ -255,14 +240,13 @@ def hull_points(rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Flo
 
 def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Which places ``[..., 3]`` all still cameras that see them take for moving."""
-    seen, moving = np.zeros((2, *points.shape[:-1]), np.int16)
+    seen = np.zeros(points.shape[:-1], np.int16)
+    moving = np.zeros_like(seen)
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
-        local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
-        ahead = local[..., 2] > camera.near
-        pixels = local @ camera.K.numpy().T / np.where(ahead, local[..., 2], 1.0)[..., None]
-        column, row = (np.floor(pixels[..., axis]).clip(-1, 2**20).astype(int) for axis in (0, 1))
-        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        seen += inside
-        moving += inside & mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+        pixels, depths = project(camera, points)
+        shown = inside(camera, pixels, depths, near=camera.near)
+        column, row = pixels[shown].astype(int).T
+        seen += shown
+        moving[shown] += mask[row, column]
     return (seen >= MIN_SEEN) & (moving == seen)

@@ -271,33 +271,31 @@ def camera_clock(source: FrameSource, camera: str) -> tuple[Path, Clock] | None:
     Raises:
         ConfigError: frames are not shown at the rate at which they were filmed.
     """
-    if isinstance(source, SourceWrapper):
-        found = camera_clock(source.source, camera)
-        if found is None:
-            return None
-        path, clock = found
-        if isinstance(source, EveryNthFrame) and source.rate is not None:
-            raise ConfigError("Frames that are not shown at the rate of the capture have no sound.")
-        earlier = source.first / source.source.fps if isinstance(source, Section) else 0.0
-        return path, Clock(clock.offset_seconds - earlier, clock.rate)
-    if not isinstance(source, VideoSource) or camera not in source.tracks:
+    filmed = innermost(source)
+    if not isinstance(filmed, VideoSource) or camera not in filmed.tracks:
         return None
-    track, stamps = source.tracks[camera], source.stamps[camera]
+    track, stamps = filmed.tracks[camera], filmed.stamps[camera]
     shown = np.flatnonzero([stamp is not None for stamp in stamps])
     if not len(shown):
         return None
     own = (np.array([stamps[i] for i in shown], np.float64) - track.origin) * track.tick_seconds
-    apart = source.apart_seconds.get(camera, np.zeros(len(stamps)))[shown]
-    common = shown / source.fps + apart
+    apart = filmed.apart_seconds.get(camera, np.zeros(len(stamps)))[shown]
+    common = shown / filmed.fps + apart
     rate = float((common[-1] - common[0]) / (own[-1] - own[0])) if len(own) > 1 else 1.0
     rate = rate if abs(rate - 1.0) > SAME_RATE else 1.0
-    return track.path, Clock(float(np.mean(common - rate * own)), rate)
+    return track.path, Clock(float(np.mean(common - rate * own)) + start_seconds(source), rate)
 
 
 def start_seconds(source: FrameSource) -> float:
-    """Presentation time of the first frame of the whole capture: not above 0."""
+    """Presentation time of the first frame of the whole capture: not above 0.
+
+    Raises:
+        ConfigError: frames are not shown at the rate at which they were filmed.
+    """
     if not isinstance(source, SourceWrapper):
         return 0.0
+    if isinstance(source, EveryNthFrame) and source.rate is not None:
+        raise ConfigError("Frames that are not shown at the rate of the capture have no sound.")
     earlier = source.first / source.source.fps if isinstance(source, Section) else 0.0
     return start_seconds(source.source) - earlier
 
@@ -348,8 +346,8 @@ def open_sound(path: Path) -> Iterator[Any]:
         yield container
 
 
-def read_audio(path: Path, *, rate: int = SAMPLE_RATE) -> NDArray[np.float32] | None:
-    """Mono samples ``[N]`` in [-1, 1]; sample ``k`` sounds at ``k / rate`` seconds of the video's time stamps.
+def read_audio(path: Path) -> NDArray[np.float32] | None:
+    """Mono samples ``[N]`` in [-1, 1] at 48 kHz; sample 0 sounds at 0 s of the video's time stamps.
 
     Where the sound starts later than time 0, silence precedes it. None when the file has no sound.
 
@@ -361,7 +359,7 @@ def read_audio(path: Path, *, rate: int = SAMPLE_RATE) -> NDArray[np.float32] | 
         if not container.streams.audio:
             return None
         stream = container.streams.audio[0]
-        resampler = av.AudioResampler(format="flt", layout="mono", rate=rate)
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=SAMPLE_RATE)
         parts: list[NDArray[np.float32]] = []
         start_seconds: float | None = None
         try:
@@ -379,7 +377,7 @@ def read_audio(path: Path, *, rate: int = SAMPLE_RATE) -> NDArray[np.float32] | 
         return None
     samples = np.concatenate(parts)
     parts.clear()  # two hours are 1.4 GB
-    first = round(start_seconds * rate)
-    if len(samples) + first > LONGEST_SECONDS * rate:
+    first = round(start_seconds * SAMPLE_RATE)
+    if len(samples) + first > LONGEST_SECONDS * SAMPLE_RATE:
         raise CaptureError(f"{path} is longer than two hours; cut it to the take.")
     return np.concatenate([np.zeros(first, np.float32), samples]) if first > 0 else samples[-first:]

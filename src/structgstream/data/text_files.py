@@ -14,7 +14,6 @@ import struct
 import tomllib
 import unicodedata
 import zipfile
-from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, BOM_UTF32_BE, BOM_UTF32_LE
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -24,15 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import CalibrationError
-
-# Longer marks first: UTF-32's begins as UTF-16's.
-ENCODINGS = (
-    (BOM_UTF32_LE, "utf-32-le"), (BOM_UTF32_BE, "utf-32-be"), (BOM_UTF8, "utf-8"), (BOM_UTF16_LE, "utf-16-le"),
-    (BOM_UTF16_BE, "utf-16-be"),
-)  # fmt: skip
-UNMARKED = {(False, True): "utf-16-le", (True, False): "utf-16-be"}
-"""By whether the first and the second byte are zero, which a character of a calibration's beginning is not."""
-
 
 MAX_PIXELS = 65_535  # of a side of a picture
 
@@ -54,14 +44,10 @@ def read_text(file: Path) -> str:
     Letters with marks are composed, as :func:`~structgstream.data.camera_files.name_of` has them.
     """
     data = file.read_bytes()
-    mark, encoding = next(((mark, name) for mark, name in ENCODINGS if data.startswith(mark)), (b"", "utf-8"))
-    if not mark and len(data) > 1:
-        encoding = UNMARKED.get((data[0] == 0, data[1] == 0), encoding)
     try:
-        text = data[len(mark) :].decode(encoding)
+        text = data.decode(json.detect_encoding(data))
     except UnicodeDecodeError as error:
-        place = f"byte {error.start + len(mark)}"
-        raise Unreadable(f"it is no Unicode text from {place} on; save it as UTF-8") from None
+        raise Unreadable(f"it is no Unicode text from byte {error.start} on; save it as UTF-8") from None
     return unicodedata.normalize("NFC", text.replace("\r\n", "\n").replace("\r", "\n"))
 
 

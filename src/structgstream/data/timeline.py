@@ -125,7 +125,7 @@ def common_slots(
     *,
     where: str,
     label: Callable[[int], str],
-    training: Collection[str] | None = None,
+    training: Collection[str],
 ) -> range:
     """The range of slots of a capture, of which cameras may lack some.
 
@@ -178,10 +178,10 @@ def common_slots(
     return range(first, last + 1)
 
 
-def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
+def _end(slots: Mapping[str, Sequence[int]], training: Collection[str]) -> int:
     """The last slot that half of the cameras, and two training cameras, reach."""
     ends = sorted((own[-1] for own in slots.values()), reverse=True)
-    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
+    trained = sorted((own[-1] for name, own in slots.items() if name in training), reverse=True)
     trained = trained or ends  # a rig without training cameras is refused where it is made
     return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
@@ -193,7 +193,7 @@ def _log_absences(
     *,
     where: str,
     label: Callable[[int], str],
-    training: Collection[str] | None,
+    training: Collection[str],
 ) -> None:
     """Warnings of absent cameras; ``slots`` are those of the range."""
     count = last - first + 1
@@ -216,10 +216,10 @@ def _log_absences(
             )  # fmt: skip
     seeing = np.zeros(count, np.int64)
     for camera, own in slots.items():
-        if training is None or camera in training:
+        if camera in training:
             seeing[np.array(own) - first] += 1
     sparse = np.flatnonzero(seeing < MIN_CAMERAS)
-    if len(sparse) and (training is None or len(training) >= MIN_CAMERAS):
+    if len(sparse) and len(training) >= MIN_CAMERAS:
         log.warning(
             "%s: %d frames, the first of them %s, have pictures of fewer than %d training cameras, so a reconstruction "
             "stops there; restore them, or choose frames before or after",
@@ -244,13 +244,6 @@ class Placed:
     frames: NDArray[np.int64]  # ``[n]`` int64, the frame of each, counted in the video
     errors: Floats  # ``[n]``, time of the frame minus the instant, in periods
     repeated: tuple[int, ...]  # slots that two frames of one instant compete for, which regular videos do not have
-
-    def within(self, instants: range) -> tuple[list[int | None], Floats]:
-        """Of each instant the frame, or None, and that frame's error in periods, ``[N]``, NaN without a frame."""
-        row_of = {slot: row for row, slot in enumerate(self.slots.tolist())}
-        rows = [row_of.get(instant) for instant in instants]
-        frames = [None if row is None else int(self.frames[row]) for row in rows]
-        return frames, np.array([np.nan if row is None else self.errors[row] for row in rows])
 
 
 def place(positions: Floats) -> Placed:
@@ -316,15 +309,41 @@ def counted_rate(seconds: Sequence[Floats]) -> float | None:
     return rate
 
 
-def log_time_error(placed: Mapping[str, Placed], slots: range, *, fps: float, where: str) -> None:
-    """Logs the largest distance of a picture to its instant, as a warning above 5 ms."""
-    worst = {}
+def paired(
+    seconds: Mapping[str, Floats], *, fps: float, where: str, training: Collection[str], one_each: bool = False
+) -> tuple[dict[str, list[int | None]], dict[str, Floats]]:
+    """By camera its frame of each instant, or None; and how long after it that one was taken, ``[N]`` s, or NaN.
+
+    The largest distance of a frame to its instant is logged, as a warning above 5 ms.
+
+    Args:
+        seconds: by camera the times of its frames on a common clock, ascending.
+        fps: instants a second.
+        one_each: whether two frames that compete for one instant are refused; else the nearer one is taken.
+
+    Raises:
+        CaptureError: see :func:`common_slots`.
+    """
+    origin = origin_of([own * fps for own in seconds.values()])
+    placed = {name: place(own * fps - origin) for name, own in seconds.items()}
+    common = common_slots(
+        {name: sorted([*own.slots.tolist(), *(own.repeated if one_each else ())]) for name, own in placed.items()},
+        where=where,
+        label=lambda slot: f"the instant {(origin + slot) / fps:.3f} s",
+        training=training,
+    )
+    frames: dict[str, list[int | None]] = {}
+    apart: dict[str, Floats] = {}
     for name, own in placed.items():
-        inside = (own.slots >= slots.start) & (own.slots < slots.stop)
-        worst[name] = 1e3 * float(np.abs(own.errors[inside]).max(initial=0.0)) / fps
+        row_of = {slot: row for row, slot in enumerate(own.slots.tolist())}
+        rows = [row_of.get(instant) for instant in common]
+        frames[name] = [None if row is None else int(own.frames[row]) for row in rows]
+        apart[name] = np.array([np.nan if row is None else own.errors[row] for row in rows]) / fps
+    worst = {name: 1e3 * float(np.nanmax(np.abs(own))) for name, own in apart.items()}
     camera = max(worst, key=lambda name: worst[name])
     text = "%s: pictures lie up to %.1f ms from their instants (camera %r)"
     if worst[camera] > 5:
         log.warning(text + "; what moves fast will not agree between cameras", where, worst[camera], camera)
     else:
         log.info(text, where, worst[camera], camera)
+    return frames, apart

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import OPAQUE, reduced_mask
-from structgstream.data.timeline import Clock, common_slots, log_time_error, measured_rate, origin_of, place
+from structgstream.data.timeline import Clock, measured_rate, paired
 from structgstream.data.video_index import (
     BT2020,
     HIGH_RANGE,
@@ -161,26 +161,13 @@ def synchronised(
         )
     # Of one frame per camera any rate is right.
     rate = fps if fps and clocks is not None else measured or fps or 30.0
-    positions = {name: times[name] * rate for name in rig}
-    origin = origin_of(list(positions.values()))
-    placed = {name: place(own - origin) for name, own in positions.items()}
-    common = common_slots(
-        # Without clocks, slots that two frames compete for are refused.
-        {
-            name: sorted([*own.slots.tolist(), *(own.repeated if clocks is None else ())])
-            for name, own in placed.items()
-        },
-        where=str(where),
-        label=lambda slot: f"the instant {(origin + slot) / rate:.3f} s",
-        training=rig.training,
-    )
-    log_time_error(placed, common, fps=rate, where=str(where))
-    stamps, errors = {}, {}
-    for name, own in placed.items():
-        frames, apart = own.within(common)
-        stamps[name] = tuple(None if frame is None else tracks[name].stamps[frame] for frame in frames)
-        errors[name] = apart / rate
-    return VideoSource(where.name, rig, rate, tracks, stamps, points, errors)
+    seconds = {name: times[name] for name in rig}
+    frames, apart = paired(seconds, fps=rate, where=str(where), training=rig.training, one_each=clocks is None)
+    stamps = {
+        name: tuple(None if frame is None else tracks[name].stamps[frame] for frame in own)
+        for name, own in frames.items()
+    }
+    return VideoSource(where.name, rig, rate, tracks, stamps, points, apart)
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import CaptureError, MissingExtraError
+from structgstream.errors import CaptureError, import_extra
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -82,11 +82,7 @@ def scan_videos(paths: Mapping[str, Path]) -> dict[str, VideoTrack]:
 
 def load_av() -> ModuleType:
     """The module ``av``, from the extra ``capture``."""
-    try:
-        import av
-    except ImportError:
-        raise MissingExtraError("av", "capture") from None
-    return av
+    return import_extra("av", "capture")
 
 
 def open_video(path: Path) -> "InputContainer":

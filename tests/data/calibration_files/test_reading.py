@@ -21,6 +21,8 @@ FILE = Path("rig.json")
     [
         (KeyError("fx"), "no 'fx'"),
         (ValueError("odd"), "values are missing, or of another form"),
+        (TypeError("odd"), "values are missing, or of another form"),
+        (IndexError("odd"), "values are missing, or of another form"),
         (Unreadable("odd"), "odd"),
         (PermissionError(13, "Permission denied", "rig.json"), "Permission denied"),
         (OSError("odd"), "values are missing, or of another form"),

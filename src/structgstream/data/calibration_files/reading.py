@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.text_files import Unreadable, mapping, number, read_json, read_text, whole
-from structgstream.errors import CalibrationError, MissingExtraError
+from structgstream.errors import CalibrationError, import_extra
 
 LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
 
@@ -66,10 +66,7 @@ def read_storage(file: Path) -> dict[str, Any]:
 
 def parsed_yaml(text: str) -> Any:
     """The content of YAML, with or without OpenCV's header; every scalar is text."""
-    try:
-        import yaml
-    except ImportError:
-        raise MissingExtraError("yaml", "capture") from None
+    yaml = import_extra("yaml", "capture")
     loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
     try:
         return yaml.load(re.sub(r"\A\s*%YAML:?.*", "", text), loader)
