@@ -19,7 +19,6 @@ from structgstream.codec.container.records import (
     PACKET_KINDS,
     RECORD,
     Head,
-    Index,
     Period,
     Record,
     RecordType,
@@ -313,14 +312,6 @@ class Contents:
 def first_run(runs: Sequence[range], index: int) -> int:
     """Place of the first of ``runs`` that does not end before frame ``index``."""
     return bisect_right(runs, index, key=lambda run: run.stop)
-
-
-def contents_by_index(index: Index, packets: Packets, table: PeriodTable, end: int) -> Contents:
-    """What an index lists; ``packets`` and ``table`` get their part."""
-    packets.offsets = index.offsets
-    packets.whole = len(index.offsets)
-    table.periods += index.periods
-    return Contents((range(len(index.offsets)),), (), True, end)
 
 
 class Scan:

@@ -19,12 +19,10 @@ from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, sound_record
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MAX_MANIFEST_BYTES,
     Edge,
     Manifest,
     SegmentEntry,
     Window,
-    manifest_from_json,
     manifest_to_json,
 )
 from structgstream.codec.segments.recovery import (
@@ -44,7 +42,7 @@ from structgstream.codec.segments.recovery import (
     without_empty_period,
 )
 from structgstream.codec.segments.store import Store
-from structgstream.codec.segments.stored_bytes import segments_from
+from structgstream.codec.segments.stored_bytes import read_manifest, segments_from
 from structgstream.errors import StorageError, StreamError
 
 
@@ -239,10 +237,8 @@ class SegmentsSink:
     def _remove(self, there: frozenset[str]) -> int:
         """Remove the stream that is to be replaced, its manifest first; returns its last sequence number."""
         sequence = 0
-        if MANIFEST in there:
-            with suppress(StreamError):  # It is being replaced, whatever it says.
-                data = self._store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
-                sequence = manifest_from_json(data, name=MANIFEST).sequence
+        with suppress(StreamError):  # It is being replaced, whatever it says.
+            sequence = read_manifest(self._store).sequence
         for name in sorted(there, key=lambda name: (name != MANIFEST, not name.startswith("init-"), name)):
             self._store.delete(name)
         return sequence
