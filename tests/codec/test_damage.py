@@ -26,16 +26,6 @@ with StreamReader(WHOLE) as _reader:
     ENDS = [_reader.packets.at(i).offset + _reader.packets.at(i).bytes for i in range(len(_reader))]
 
 
-@given(st.integers(0, len(WHOLE)))
-@examples(300)
-def test_a_stream_cut_anywhere_goes_on_after_its_last_whole_packet(cut: int) -> None:
-    assert readable_part(WHOLE[:cut], name="it") == max((end for end in ENDS if end <= cut), default=None)
-
-
-def test_a_finished_stream_goes_on_before_its_index() -> None:
-    assert readable_part(WHOLE, name="it") == ENDS[-1] < len(WHOLE)
-
-
 @given(st.integers(PREFIX.size, ENDS[-2] - 1), st.integers(0, 7))
 @examples(400)
 def test_a_bit_that_flipped_never_costs_whole_frames(byte: int, bit: int) -> None:
@@ -65,12 +55,6 @@ def test_damage_at_the_end_is_a_write_that_was_interrupted() -> None:
 @pytest.mark.parametrize("data", [b"", prefix()[:3], prefix()])
 def test_what_was_hardly_begun_begins_again(data: bytes) -> None:
     assert readable_part(data, name="it") is None
-
-
-@pytest.mark.parametrize("data", [b"Dear", b"\x89SGX" + bytes(20), WHOLE[1:]])
-def test_what_is_no_stream_is_not_overwritten(data: bytes) -> None:
-    with pytest.raises(StreamError, match="it is not a structgstream file"):
-        readable_part(data, name="it")
 
 
 FRAMES = 8

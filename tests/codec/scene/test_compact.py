@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 import torch
 
@@ -33,7 +32,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, flatten_head, scene_of, state_of
 from tests.support.properties import thinned
 from tests.support.rigs import random_scene
-from tests.support.streams import STATIC_STEP, STEPS, compact_header, same, small_scene
+from tests.support.streams import STATIC_STEP, compact_header, same, small_scene
 
 FREE: frozenset[FieldName] = frozenset({"free", "free_births"})
 DYNAMICS: list[frozenset[FieldName]] = [
@@ -177,24 +176,6 @@ def test_what_stands_still_keeps_its_bins_and_costs_next_to_nothing() -> None:
     # From what is drawn to the file nothing is rounded a second time.
     again = written([seen[0]] * 2, header, keys=(0,))[1]
     assert same(again[1], seen[0])
-
-
-def test_bytes_of_each_field_add_up() -> None:
-    _, data, _, packets = small()
-    reader = StreamReader(data)
-    for packet, info in zip(packets, reader.packets, strict=True):
-        assert info.field_bytes == packet.field_bytes
-        assert info.field_bytes.keys() == PAPER_DYNAMIC
-        assert sum(packet.field_bytes.values()) + 12 == len(packet.payload)
-
-
-def test_the_header_comes_back() -> None:
-    header = compact_header(small_scene(3, free=2), steps={name: float(np.float32(0.013)) for name in STEPS})
-    back = unpack_header(pack_header(header))
-    assert (back.codec, back.steps, back.dynamic) == ("compact", header.steps, header.dynamic)
-    assert back.reference.keys() == {"anchor_positions", "offset_scales", "covariance_mlp"}
-    assert all(torch.equal(back.reference[name], value) for name, value in header.reference.items())
-    assert back.static.keys() == header.static.keys()
 
 
 def without(header: StreamHeader, name: str) -> dict[str, float]:
