@@ -10,7 +10,7 @@ from functools import cache
 import pytest
 import torch
 
-from structgstream.codec.container.blocks import coded_payloads
+from structgstream.codec.container.blocks import unpack_blocks
 from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
 from structgstream.codec.fields.packet_fields import CODABLE
 from structgstream.codec.packets import (
@@ -259,13 +259,13 @@ def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index
     header, _, seen, packets = small()
     decoder = CompactCoder(header)
     for packet in packets[(index // 3) * 3 : index]:
-        decoder.decode(coded_payloads(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
+        decoder.decode(unpack_blocks(packet.payload, FRAME.size, where="")[1], kind=packet.kind, index=packet.index)
     state, failed, different = decoder.state, 0, 0
     for payload in flipped(packets[index].payload, range(FRAME.size, len(packets[index].payload))):
         decoder.state = state
         try:
             packet = parse_packet(payload, packets[index].kind)
-            found = decoder.decode(coded_payloads(payload, FRAME.size, where=""), kind=packet.kind, index=index)
+            found = decoder.decode(unpack_blocks(payload, FRAME.size, where="")[1], kind=packet.kind, index=index)
         except StreamError:
             failed += 1
             continue
