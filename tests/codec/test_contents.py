@@ -38,6 +38,7 @@ from tests.support.period_streams import (
     period_of,
     period_packets,
     period_stream,
+    write_packets,
 )
 from tests.support.properties import thinned
 from tests.support.rigs import arc_rig
@@ -171,19 +172,9 @@ def test_a_file_cut_anywhere_shows_what_is_whole_and_goes_on_to_the_same_bytes(t
             reader = StreamReader(data[:cut])
             assert (len(reader), reader.complete) == (frames, cut == len(data) or cut >= len(data) - 16)
             assert not frames or same(reader.scene(frames - 1), seen[frames - 1])
-        resume(path, headers, packets)
+        sink, resumed = FileSink.resume(path)
+        write_packets(sink, headers, packets, start=0 if resumed is None else len(resumed))
         assert path.read_bytes() == data, cut
-
-
-def resume(path: Path, headers: list, packets: list) -> None:
-    sink, reader = FileSink.resume(path)
-    start = 0 if reader is None else len(reader)
-    sink.open(headers[period_of(max(start - 1, 0))])
-    for packet in packets[start:]:
-        if packet.index and packet.index in FIRSTS:
-            sink.begin(headers[FIRSTS.index(packet.index)])
-        sink.write(packet)
-    sink.close()
 
 
 def test_an_orderly_stop_where_a_period_would_begin_leaves_nothing_of_it() -> None:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compact codec from scene to file and back."""
 
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -11,7 +9,7 @@ import pytest
 import torch
 
 from structgstream.codec.container.blocks import unpack_blocks
-from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
+from structgstream.codec.container.records import FRAME, scan_records
 from structgstream.codec.fields.packet_fields import CODABLE
 from structgstream.codec.packets import (
     Packet,
@@ -226,25 +224,6 @@ def test_a_raw_block_in_a_compact_packet_and_the_other_way_round() -> None:
         SceneDecoder(header).decode(packet)
     with pytest.raises(StreamError, match="holds field anchor_positions coded; expected raw"):
         SceneDecoder(raw).decode(packets[0])
-
-
-def mended(data: bytes) -> bytes:
-    """The stream with right checksums, wherever the records' heads still stand."""
-    out, start = bytearray(data), 12
-    while start + RECORD.size + 4 <= len(out):
-        end = start + RECORD.size + RECORD.unpack_from(out, start)[3]
-        if end + 4 > len(out):
-            break
-        struct.pack_into("<I", out, end, zlib.crc32(out[start:end]))
-        if out[start] == RecordType.INDEX:
-            break
-        start = end + 4
-    return bytes(out)
-
-
-def test_mending_leaves_a_good_stream_as_it_is() -> None:
-    data = small()[1]
-    assert mended(data) == data
 
 
 def flipped(data: bytes, places: Sequence[int]) -> Iterator[bytes]:

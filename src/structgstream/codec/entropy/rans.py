@@ -171,9 +171,7 @@ def decode(
 
 
 def uses_native(native: bool | None) -> bool:
-    """Whether to use C++; None uses it if available. Raises StreamError if it is requested and not available."""
-    if native and not has_native():
-        raise StreamError("The installed native library has no entropy coder; install structgstream again.")
+    """Whether to use C++; None uses it if available."""
     return has_native() if native is None else native
 
 
