@@ -39,7 +39,7 @@ def test_packets_after_a_lost_one_are_found_by_their_frame() -> None:
     offsets = [record.offset for record in records()]
     found = table(whole(), offsets=[*offsets[:2], LOST, *offsets[3:]])
     found.whole = 2
-    assert [info.index for info in found] == [0, 1]
+    assert [info.index for info in found] == [info.index for info in found[:]] == [0, 1]
     with pytest.raises(IndexError):
         found[3]
     assert (found.at(3).index, found.packet(4).index) == (3, 4)
