@@ -10,7 +10,7 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig, Similarity
-from structgstream.codec.container.blocks import pack_raw_block, unpack_raw_blocks
+from structgstream.codec.container.blocks import pack_raw_block, unpack_blocks
 from structgstream.codec.fields.packet_fields import dequantize_state, quantize_state
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene_coder import CompactCoder, CompactState
@@ -133,7 +133,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
     return [
         Contestant(
             "raw, decode, 1 thread",
-            lambda: _values(unpack_raw_blocks(work.raw, 0, where="The frame")),
+            lambda: _values(unpack_blocks(work.raw, 0, where="The frame")[0]),
             1,
             facts=facts("raw"),
         ),

@@ -12,8 +12,9 @@ import zstandard
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.codec.entropy import rans
-from structgstream.codec.entropy.bits import ALPHABET, residuals_to_symbols
-from structgstream.codec.entropy.tables import FrequencyTables, choose_tables, decode_tables, geometric
+from structgstream.codec.entropy.bits import zigzag
+from structgstream.codec.entropy.rans import ALPHABET, LARGEST_SYMBOL
+from structgstream.codec.entropy.tables import FrequencyTables, choose_tables, decode_tables, geometric_family
 
 CONTEXTS = 50
 Symbols = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -23,7 +24,8 @@ def workload(symbols: int) -> Symbols:
     """Symbols u8 ``[n]``, contexts u16 ``[n]``, counts ``[50, 16]``: Laplace residuals of scales 0.2 to 1, rounded."""
     g = np.random.default_rng(5)
     contexts = g.integers(0, CONTEXTS, symbols).astype(np.uint16)
-    values, _ = residuals_to_symbols(np.rint(g.laplace(0, np.linspace(0.2, 1.0, CONTEXTS)[contexts])).astype(np.int64))
+    residuals = np.rint(g.laplace(0, np.linspace(0.2, 1.0, CONTEXTS)[contexts])).astype(np.int64)
+    values = zigzag(residuals.clip(-LARGEST_SYMBOL, LARGEST_SYMBOL)).astype(np.uint8)
     counts = np.zeros((CONTEXTS, ALPHABET), np.int64)
     np.add.at(counts, (contexts, values), 1)
     return values, contexts, counts
@@ -31,7 +33,7 @@ def workload(symbols: int) -> Symbols:
 
 def defaults() -> FrequencyTables:
     """What a key frame's tables are relative to."""
-    return geometric(np.full(CONTEXTS, 100), alphabet=ALPHABET)
+    return FrequencyTables(geometric_family(ALPHABET)[np.full(CONTEXTS, 100)])
 
 
 def _symbols(symbols: np.ndarray) -> Results:
@@ -44,7 +46,7 @@ def _ours(work: Symbols, *, native: bool, lanes: int | None = None) -> Contestan
     section = rans.encode(values, contexts, tables, lanes=lanes)
 
     def decode() -> Results:
-        return _symbols(rans.decode(section, contexts, decode_tables(bits, defaults()), native=native))
+        return _symbols(rans.decode(section, contexts, decode_tables(bits, defaults()), native=native)[0])
 
     name = ("cpu" if native else "NumPy reference") + (f", lanes: {lanes}" if lanes else "") + ", 1 thread"
     return _contestant(name, decode, len(bits) + len(section), work)

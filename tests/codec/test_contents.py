@@ -38,6 +38,7 @@ from tests.support.period_streams import (
     period_of,
     period_packets,
     period_stream,
+    write_packets,
 )
 from tests.support.properties import thinned
 from tests.support.rigs import arc_rig
@@ -171,19 +172,9 @@ def test_a_file_cut_anywhere_shows_what_is_whole_and_goes_on_to_the_same_bytes(t
             reader = StreamReader(data[:cut])
             assert (len(reader), reader.complete) == (frames, cut == len(data) or cut >= len(data) - 16)
             assert not frames or same(reader.scene(frames - 1), seen[frames - 1])
-        resume(path, headers, packets)
+        sink, resumed = FileSink.resume(path)
+        write_packets(sink, headers, packets, start=0 if resumed is None else len(resumed))
         assert path.read_bytes() == data, cut
-
-
-def resume(path: Path, headers: list, packets: list) -> None:
-    sink, reader = FileSink.resume(path)
-    start = 0 if reader is None else len(reader)
-    sink.open(headers[period_of(max(start - 1, 0))])
-    for packet in packets[start:]:
-        if packet.index and packet.index in FIRSTS:
-            sink.begin(headers[FIRSTS.index(packet.index)])
-        sink.write(packet)
-    sink.close()
 
 
 def test_an_orderly_stop_where_a_period_would_begin_leaves_nothing_of_it() -> None:
@@ -266,29 +257,6 @@ def table(data: bytes | bytearray | None = None) -> PeriodTable:
     return found
 
 
-def test_a_table_begins_with_the_first_period() -> None:
-    found = PeriodTable(b"", "a.sgs", inits()[0])
-    assert found.periods == [Period(0, 0, inits()[0].offset, inits()[0].end - inits()[0].offset)]
-    assert found.header(0) is found.first
-
-
-def test_one_header_besides_the_first_is_kept() -> None:
-    found = table()
-    first = found.header(1)
-    assert found.header(1) is first
-    found.header(0)
-    assert found.header(1) is first
-    found.header(2)
-    assert found.header(1) is not first
-
-
-def test_bytes_of_fields_are_those_of_the_periods_own_record() -> None:
-    found = table()
-    sizes = [found.field_bytes(place) for place in range(len(LENGTHS))]
-    assert sizes[0]["base_scales"] < sizes[1]["base_scales"] < sizes[2]["base_scales"]
-    assert all(sum(size.values()) < len(record.payload) for size, record in zip(sizes, inits(), strict=True))
-
-
 @pytest.mark.parametrize("kind", [RecordType.INIT, RecordType.KEY])
 def test_a_whole_record_of_another_number_or_type_is_refused(kind: RecordType) -> None:
     record = packed(kind, inits()[1].payload, period=1 if kind == RecordType.KEY else 2)
@@ -335,8 +303,3 @@ def test_what_may_change_from_period_to_period_does() -> None:
     changed = replace(period_header(2, codec=CODEC), config={"seed": 9}, metadata={"note": "later"})
     header = table().check(Record(RecordType.INIT, pack_header(changed), 0, 1))
     assert (header.config, header.metadata) == ({"seed": 9}, {"note": "later"})
-
-
-def test_a_first_record_that_is_no_header_is_refused() -> None:
-    with pytest.raises(StreamError):
-        PeriodTable(b"", "a.sgs", Record(RecordType.INIT, b"nothing", 12))

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec import contents
-from structgstream.codec.container.records import PREFIX, RECORD, RecordType, prefix, read_record, scan_records
-from structgstream.codec.contents import MIN_PACKET_BYTES, Damage, PacketSearch, Standing, readable_part
+from structgstream.codec.container.records import PREFIX, RECORD, RecordType, prefix, scan_records
+from structgstream.codec.contents import MIN_PACKET_BYTES, Damage, PacketSearch, Standing
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.codec.sinks import FileSink, MemorySink, readable_part
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from tests.support.properties import examples
@@ -24,23 +24,6 @@ from tests.support.streams import compact_header, moved, same, small_scene, smal
 WHOLE = small_stream()
 with StreamReader(WHOLE) as _reader:
     ENDS = [_reader.packets.at(i).offset + _reader.packets.at(i).bytes for i in range(len(_reader))]
-
-
-def init_end() -> int:
-    record = read_record(WHOLE, PREFIX.size)
-    assert record is not None
-    return record.end
-
-
-@given(st.integers(0, len(WHOLE)))
-@examples(300)
-def test_a_stream_cut_anywhere_goes_on_after_its_last_whole_packet(cut: int) -> None:
-    whole = [end for end in (init_end(), *ENDS) if end <= cut]
-    assert readable_part(WHOLE[:cut], name="it") == (max(whole) if whole else None)
-
-
-def test_a_finished_stream_goes_on_before_its_index() -> None:
-    assert readable_part(WHOLE, name="it") == ENDS[-1] < len(WHOLE)
 
 
 @given(st.integers(PREFIX.size, ENDS[-2] - 1), st.integers(0, 7))
@@ -72,12 +55,6 @@ def test_damage_at_the_end_is_a_write_that_was_interrupted() -> None:
 @pytest.mark.parametrize("data", [b"", prefix()[:3], prefix()])
 def test_what_was_hardly_begun_begins_again(data: bytes) -> None:
     assert readable_part(data, name="it") is None
-
-
-@pytest.mark.parametrize("data", [b"Dear", b"\x89SGX" + bytes(20), WHOLE[1:]])
-def test_what_is_no_stream_is_not_overwritten(data: bytes) -> None:
-    with pytest.raises(StreamError, match="it is not a structgstream file"):
-        readable_part(data, name="it")
 
 
 FRAMES = 8

@@ -14,7 +14,8 @@ import torch
 
 from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
 from structgstream.codec.entropy import rans
-from structgstream.codec.entropy.rans import SectionDecoder, varint
+from structgstream.codec.entropy.bits import varint
+from structgstream.codec.entropy.rans import SectionDecoder
 from structgstream.codec.fields.packet_fields import CODABLE
 from structgstream.codec.fields.static_fields import decode_fields
 from structgstream.codec.packets import PacketKind, StreamHeader, pack_header, unpack_header
@@ -49,35 +50,27 @@ def header_with_all() -> StreamHeader:
 
 def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]:
     """Where decoding reads counts: numbers, and those in the heads of sections."""
-    found: set[Count] = set()
-    number, section_bytes, read = SectionDecoder.number, rans.section_bytes, rans._read_varint
-    sections: list[tuple[FieldName, int]] = []
+    found: list[Count] = []
+    number, read = SectionDecoder.number, rans.read_varint
 
     def logged_number(self: SectionDecoder, name: str, value: int | None) -> int:
-        field: FieldName = next(known for known in fields if known == name.partition(".")[0])
-        start = len(fields[field]) - len(self._left[field])
         result = number(self, name, value)
-        if not name.endswith(VALUES):
-            found.add(Count(field, start, len(fields[field]) - len(self._left[field])))
+        if name.endswith(VALUES):
+            found.pop()
         return result
 
-    def logged_section(data: memoryview, *, where: str) -> int:
-        field: FieldName = next(known for known in fields if fields[known].endswith(bytes(data)))
-        sections.append((field, len(fields[field]) - len(data)))
-        return section_bytes(data, where=where)
-
-    def logged_read(data: memoryview, start: int, *, where: str) -> tuple[int, int]:
+    def logged_read(data: memoryview, start: int = 0, *, where: str) -> tuple[int, int]:
         value, end = read(data, start, where=where)
-        field, base = sections[-1]
-        found.add(Count(field, base + start, base + end))
+        field: FieldName = next(known for known in fields if fields[known].endswith(bytes(data)))
+        base = len(fields[field]) - len(data)
+        found.append(Count(field, base + start, base + end))
         return value, end
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SectionDecoder, "number", logged_number)
-        patch.setattr(rans, "section_bytes", logged_section)
-        patch.setattr(rans, "_read_varint", logged_read)
+        patch.setattr(rans, "read_varint", logged_read)
         decode(fields)
-    return sorted(found)
+    return sorted({*found})
 
 
 def enlarged(fields: Fields, counts: list[Count]) -> Iterator[tuple[Count, int, Fields]]:

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.contents import LOST, Packets
-from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 from tests.support.streams import small_stream
@@ -36,43 +35,11 @@ def table(data: bytes | bytearray, *, offsets: list[int] | None = None) -> Packe
     return found
 
 
-def test_facts_are_those_of_the_records() -> None:
-    found = table(whole())
-    assert len(found) == FRAMES
-    for index, (info, record) in enumerate(zip(found, records(), strict=True)):
-        assert info.kind is (PacketKind.DELTA if index % 3 else PacketKind.KEY)
-        assert (info.index, info.pts_seconds, info.offset) == (index, index / 30.0, record.offset)
-        assert info.bytes == record.end - record.offset
-        # The payload begins with frame and time, 12 bytes; the rest are blocks of fields.
-        assert sum(info.field_bytes.values()) == len(record.payload) - 12
-
-
-def test_packets_are_those_of_the_records() -> None:
-    found = table(whole())
-    for index, record in enumerate(records()):
-        packet = found.packet(index)
-        assert (packet.index, packet.payload) == (index, record.payload)
-
-
-@given(st.slices(FRAMES), st.integers(-FRAMES, FRAMES - 1))
-def test_it_is_indexed_as_a_list(part: slice, index: int) -> None:
-    found = table(whole())
-    listed = [*found]
-    assert found[part] == listed[part]
-    assert found[index] == listed[index]
-
-
-@pytest.mark.parametrize("index", [FRAMES, -FRAMES - 1])
-def test_beyond_the_last_whole_packet_there_is_none(index: int) -> None:
-    with pytest.raises(IndexError):
-        table(whole())[index]
-
-
 def test_packets_after_a_lost_one_are_found_by_their_frame() -> None:
     offsets = [record.offset for record in records()]
     found = table(whole(), offsets=[*offsets[:2], LOST, *offsets[3:]])
     found.whole = 2
-    assert [info.index for info in found] == [0, 1]
+    assert [info.index for info in found] == [info.index for info in found[:]] == [0, 1]
     with pytest.raises(IndexError):
         found[3]
     assert (found.at(3).index, found.packet(4).index) == (3, 4)

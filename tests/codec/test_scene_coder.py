@@ -87,10 +87,6 @@ HEADER = header_for(SCENE)
 PAYLOAD = SceneEncoder(HEADER).encode(SCENE, index=7, pts_seconds=0.25, kind=PacketKind.KEY).packet.payload
 
 
-def test_a_packet_holds_the_scene() -> None:
-    assert same(SceneDecoder(HEADER).decode(parse_packet(PAYLOAD, PacketKind.DELTA)), SCENE)
-
-
 def test_another_codec_is_refused() -> None:
     with pytest.raises(StreamError, match="coded with 'tiny'; this version knows 'raw' and 'compact'. Install a newer"):
         SceneDecoder(replace(HEADER, codec="tiny"))

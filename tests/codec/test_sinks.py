@@ -11,7 +11,7 @@ import pytest
 from structgstream.codec.container import byte_source
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.packets import Packet, PacketKind
-from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.reader import open_stream
 from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StorageError, StreamError
@@ -247,13 +247,6 @@ def test_a_file_cut_anywhere_is_continued(tmp_path: Path) -> None:
         assert path.read_bytes() == whole
 
 
-def test_a_resumed_file_that_is_not_opened_stays_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "a.sgs"
-    path.write_bytes(small_stream())
-    FileSink.resume(path)[0].close()
-    assert path.read_bytes() == small_stream()
-
-
 def test_what_cannot_be_resumed(tmp_path: Path) -> None:
     damaged = bytearray(small_stream())
     damaged[40] ^= 1
@@ -275,10 +268,3 @@ def test_what_cannot_be_resumed(tmp_path: Path) -> None:
         assert path.read_bytes() == content
     with pytest.raises(StreamError, match="Cannot read"):
         FileSink.resume(tmp_path)
-
-
-def test_resuming_nothing_begins(tmp_path: Path) -> None:
-    sink, reader = FileSink.resume(tmp_path / "a.sgs")
-    assert reader is None
-    write_stream(sink, SCENES)
-    assert len(StreamReader(sink.path.read_bytes())) == 4

@@ -3,7 +3,6 @@
 
 import math
 
-import pytest
 import torch
 
 from structgstream.cameras import Similarity
@@ -24,11 +23,6 @@ def two(sh: torch.Tensor) -> BakedGaussians:
         opacities=torch.tensor([0.3, 0.9]),
         sh=sh,
     )
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_the_degree_follows_from_the_number_of_coefficients(degree: int) -> None:
-    assert two(torch.zeros(2, (degree + 1) ** 2, 3)).degree == degree
 
 
 def test_colours_by_hand() -> None:
@@ -61,14 +55,6 @@ def test_y_up_shows_the_same_to_a_camera_that_is_turned_alike() -> None:
     axes, wanted = (quaternion_matrices(g.quats) * g.scales[:, None] for g in (turned, gaussians))
     turn = torch.diag(half_turn)
     torch.testing.assert_close(axes @ axes.mT, turn @ wanted @ wanted.mT @ turn)
-
-
-def test_rows_are_chosen_in_the_order_asked_for() -> None:
-    both = two(torch.arange(6.0).reshape(2, 1, 3))
-    turned = both.select(torch.tensor([1, 0]))
-    assert turned.opacities.tolist() == both.opacities.flip(0).tolist()
-    assert turned.sh[:, 0, 0].tolist() == [3.0, 0.0]
-    assert len(both.select(torch.tensor([False, True]))) == 1
 
 
 def test_in_the_units_of_the_capture() -> None:

@@ -47,16 +47,14 @@ def period_packets(*, codec: str = "compact") -> tuple[list[StreamHeader], list[
 
 def write_packets(
     sink: PacketSink, headers: Sequence[StreamHeader], packets: Sequence[Packet], *, start: int = 0
-) -> list[int]:
-    """Write these packets from frame ``start`` on, as a session does, and close; returns what each took."""
+) -> None:
+    """Write these packets from frame ``start`` on, as a session does, and close."""
     sink.open(headers[period_of(max(start - 1, 0))])
-    sizes = []
     for packet in packets[start:]:
         if packet.index and packet.index in FIRSTS:
             sink.begin(headers[FIRSTS.index(packet.index)])
-        sizes.append(sink.write(packet))
+        sink.write(packet)
     sink.close()
-    return sizes
 
 
 @cache

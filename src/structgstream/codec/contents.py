@@ -1,34 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a stream holds: packets and periods, found by reading every record, or by its index; and after damage, where
-whole records go on, and a writer may (docs/bitstream.md, section Damage)."""
+whole records go on (docs/bitstream.md, section Damage)."""
 
 import math
 import re
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import overload
 
-from structgstream.codec.container.blocks import LENGTH, field_sizes, iterate_blocks, read_description
+from structgstream.codec.container.blocks import LENGTH, field_sizes, iterate_blocks
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource
 from structgstream.codec.container.records import (
     CHECKSUM,
     FRAME,
     INDEX_ENTRY,
     PACKET_KINDS,
-    PREFIX,
     RECORD,
     Head,
-    Index,
     Period,
     Record,
     RecordType,
-    check_prefix,
-    incomplete_reason,
     indexed_frames,
-    may_be_prefix,
     period_at,
     read_head,
     read_record,
@@ -128,58 +122,6 @@ def _fits(record: Record, standing: Standing) -> bool:
     if record.type != RecordType.INDEX:
         return True
     return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)
-
-
-def _states_sound(payload: bytes) -> bool:
-    """Whether the description of an init record states sound; what is no description is reported by who reads it."""
-    with suppress(StreamError, ValueError):
-        return "sound" in read_description(payload)
-    return False
-
-
-def readable_part(data: ByteSource, *, name: str) -> int | None:
-    """End of the last whole packet, before the index; None if the file is truncated within the init record.
-
-    In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
-
-    Raises:
-        StreamError: not a stream, another major version, or a damaged init record, after which restarting would
-            destroy frames.
-    """
-    if may_be_prefix(data[: PREFIX.size + 1]):
-        return None  # Cut within the prefix, or empty.
-    check_prefix(data, name)
-    end, standing, complete = PREFIX.size, Standing(PREFIX.size, 0, -math.inf), False
-    has_sound = False
-    for record in scan_records(data):
-        if complete := record.type == RecordType.INDEX:
-            break
-        standing = replace(standing, offset=record.end)
-        if record.type == RecordType.INIT and record.offset > PREFIX.size:
-            standing = replace(standing, period=record.period)
-            continue  # What a period begins with is written with its first packet, and again when that is cut.
-        is_packet = record.type in (RecordType.KEY, RecordType.DELTA)
-        if not (is_packet and has_sound):
-            end = record.end
-        if record.type == RecordType.INIT:
-            standing = replace(standing, period=record.period)
-            has_sound = _states_sound(record.payload)
-        elif is_packet:
-            standing = replace(standing, frames=standing.frames + 1)
-    # A crash cannot leave whole frames after a damaged one; a failing disk can.
-    lost = not complete and PacketSearch(data).next(standing.offset, standing) is not None
-    if end > PREFIX.size:
-        if lost:
-            raise StreamError(
-                f"Cannot continue {name}: {incomplete_reason(data, standing.offset)}, and continuing would overwrite "
-                f"the whole frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to "
-                "fit them again."
-            )
-        return end
-    reason = incomplete_reason(data, end)
-    if lost or "damaged" in reason:
-        raise StreamError(f"Cannot continue {name}: {reason}. Keep a copy; then start again with --overwrite.")
-    return None
 
 
 LOST = 2**64 - 1
@@ -370,14 +312,6 @@ class Contents:
 def first_run(runs: Sequence[range], index: int) -> int:
     """Place of the first of ``runs`` that does not end before frame ``index``."""
     return bisect_right(runs, index, key=lambda run: run.stop)
-
-
-def contents_by_index(index: Index, packets: Packets, table: PeriodTable, end: int) -> Contents:
-    """What an index lists; ``packets`` and ``table`` get their part."""
-    packets.offsets = index.offsets
-    packets.whole = len(index.offsets)
-    table.periods += index.periods
-    return Contents((range(len(index.offsets)),), (), True, end)
 
 
 class Scan:

@@ -26,7 +26,7 @@ from structgstream.codec.container.records import (
     read_index,
     read_record,
 )
-from structgstream.codec.contents import Damage, PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
+from structgstream.codec.contents import Contents, Damage, PacketInfo, Packets, PeriodTable, Scan, first_run
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
@@ -91,7 +91,10 @@ class StreamReader:
         self._table = PeriodTable(data, name, init)
         index = read_index(data, init.end, period=init.period) if by_index and not gone else None
         if index is not None:
-            contents = contents_by_index(index, self.packets, self._table, init.end)
+            self.packets.offsets, later = index
+            self.packets.whole = len(self.packets.offsets)
+            self._table.periods += later
+            contents = Contents((range(len(self.packets.offsets)),), (), True, init.end)
         else:
             contents = Scan(data, name, self.packets, self._table, gone=gone).contents(init.end)
         self.runs: list[range] = [*contents.runs]

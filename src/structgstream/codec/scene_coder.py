@@ -13,18 +13,13 @@ trainer and viewers would diverge.
 """
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from structgstream.codec.container.blocks import (
-    coded_payloads,
-    pack_coded_block,
-    pack_raw_block,
-    unpack_raw_blocks,
-)
+from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block, unpack_blocks
 from structgstream.codec.container.records import FRAME
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.decisions import Models
@@ -149,26 +144,23 @@ class SceneDecoder:
         """The scene of one frame, on the CPU, in normalised units. Raises StreamError if the packet's fields are not
         the header's dynamic ones, their shapes are inconsistent, or the packet before it has not been decoded."""
         header, where = self._header, f"Packet {packet.index}"
-        if self._compact is None:
-            dynamic = unpack_raw_blocks(packet.payload, FRAME.size, where=where)
-        else:
-            coded = coded_payloads(packet.payload, FRAME.size, where=where)
-            _check_fields(coded.keys(), header, where)
+        dynamic, coded = unpack_blocks(packet.payload, FRAME.size, where=where)
+        if self._compact is None and coded:
+            raise StreamError(f"{where} holds field {next(iter(coded))} coded; expected raw.")
+        if self._compact is not None and dynamic:
+            raise StreamError(f"{where} holds field {next(iter(dynamic))} raw; expected coded.")
+        if (names := dynamic.keys() | coded.keys()) != header.dynamic:
+            raise StreamError(
+                f"{where} holds {', '.join(sorted(names)) or 'no field'}; "
+                f"the header announces {', '.join(sorted(header.dynamic)) or 'none'}."
+            )
+        if self._compact is not None:
             dynamic = self._compact.decode(coded, kind=packet.kind, index=packet.index)
-        _check_fields(dynamic.keys(), header, where)
         fields: dict[FieldName, Tensor] = {**header.static, **dynamic}
         check_shapes(
             fields, distance_input=header.distance_input, training_cameras=len(header.rig.training), where=where
         )
         return scene_of(fields, distance_input=header.distance_input, sampling=self._sampling)
-
-
-def _check_fields(names: Set[FieldName], header: StreamHeader, where: str) -> None:
-    if names != header.dynamic:
-        raise StreamError(
-            f"{where} holds {', '.join(sorted(names)) or 'no field'}; "
-            f"the header announces {', '.join(sorted(header.dynamic)) or 'none'}."
-        )
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 """Packet sinks: a file, crash-safe, or memory; and streams of segments to continue."""
 
 import io
+import math
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,22 +14,27 @@ from structgstream.atomic_files import append_durably, lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
 from structgstream.codec.container.records import (
     INDEX_ENTRY,
+    PREFIX,
     RECORD_TYPES,
     Period,
     RecordType,
+    check_prefix,
+    incomplete_reason,
+    may_be_prefix,
     pack_index,
     packed,
     period_at,
     prefix,
+    read_record,
 )
-from structgstream.codec.contents import LOST, PacketInfo, Packets, readable_part
+from structgstream.codec.contents import LOST, PacketInfo, Packets, PacketSearch, Standing
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header, sound_record
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes
-from structgstream.errors import StorageError
+from structgstream.errors import StorageError, StreamError
 
 
 class _Writer:
@@ -121,6 +127,39 @@ class _Writer:
         return len(data)
 
 
+def readable_part(data: ByteSource, *, name: str) -> int | None:
+    """End of the last whole packet, before the index; None if there is no whole packet.
+
+    In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
+
+    Raises:
+        StreamError: not a stream, another major version, or damage before whole frames, which writing would destroy.
+    """
+    if may_be_prefix(data[: PREFIX.size + 1]):
+        return None  # Cut within the prefix, or empty.
+    check_prefix(data, name)
+    if read_record(data, PREFIX.size) is None:
+        reason = incomplete_reason(data, PREFIX.size)
+        following = PacketSearch(data).next(PREFIX.size, Standing(PREFIX.size, 0, -math.inf))
+        if "damaged" in reason or following is not None:
+            raise StreamError(f"Cannot continue {name}: {reason}. Keep a copy; then start again with --overwrite.")
+        return None
+    reader = StreamReader(data, name=name)
+    # A crash cannot leave whole frames after a damaged one; a failing disk can.
+    frames = reader.damage[0].frames.start if reader.damage else len(reader)
+    if frames and reader.header.sound is not None and reader.sound(frames - 1) is None:
+        frames -= 1
+    last = reader.packets.at(frames - 1) if frames else reader.periods[0]
+    end = last.offset + last.bytes
+    if reader.damage:
+        raise StreamError(
+            f"Cannot continue {name}: {incomplete_reason(data, reader.damage[0].offset)}, and continuing would "
+            f"overwrite the whole frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume "
+            "to fit them again."
+        )
+    return end if frames else None
+
+
 class FileSink:
     """A stream file. Every packet is on the disk when ``write`` returns; a failed write is truncated.
 
@@ -148,10 +187,9 @@ class FileSink:
         sink = cls(path, overwrite=True)
         data: ByteSource = FileBytes(path) if sink.path.exists() else b""
         sink._size = len(data)
-        end = readable_part(data, name=str(path))
-        reader = None if end is None else StreamReader(ByteSlice(data, 0, end), name=str(path))
-        if end is None or reader is None or not reader.packets:
+        if (end := readable_part(data, name=str(path))) is None:
             return sink, None
+        reader = StreamReader(ByteSlice(data, 0, end), name=str(path))
         sink._resumed = (end, reader)
         return sink, reader
 

@@ -127,7 +127,6 @@ def read_header(path: Path) -> PlyHeader:
     if any(len(line) != 3 or line[1] not in TYPES for line in fields):
         raise CaptureError(f"{path} has properties of vertices that are lists or of unknown types.")
     row = np.dtype([(name, TYPES[kind]) for _, kind, name in fields])
-    assert row.names is not None or not fields
     names = set(row.names or ())
     rest = len([name for name in names if name.startswith("f_rest_")])
     degree = math.isqrt(rest // 3 + 1) - 1

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.blocks import iterate_blocks, pack_raw_block, unpack_raw_blocks
+from structgstream.codec.container.blocks import iterate_blocks, pack_raw_block, unpack_blocks
 from structgstream.errors import StreamError
 
 
@@ -27,7 +27,7 @@ def test_every_bit_pattern_comes_back(shape: list[int], seed: int) -> None:
     bits = torch.randint(-(2**31), 2**31, tuple(shape), generator=generator, dtype=torch.int64).to(torch.int32)
     value = bits.view(torch.float32)  # NaN with payloads and subnormals among them
     payload = b"head" + pack_raw_block("free", value) + pack_raw_block("free_births", bits.long())
-    found = unpack_raw_blocks(payload, 4, where="Packet 0")
+    found = unpack_blocks(payload, 4, where="Packet 0")[0]
     assert found["free"].shape == value.shape
     assert torch.equal(found["free"].view(torch.int32), bits)
     assert torch.equal(found["free_births"], bits.long())
@@ -37,7 +37,7 @@ def test_every_bit_pattern_comes_back(shape: list[int], seed: int) -> None:
 
 def test_doubles_and_strided_tensors_are_stored_as_floats_row_by_row() -> None:
     value = torch.arange(6, dtype=torch.float64).reshape(2, 3).T
-    assert torch.equal(unpack_raw_blocks(pack_raw_block("free", value), 0, where="x")["free"], value.float())
+    assert torch.equal(unpack_blocks(pack_raw_block("free", value), 0, where="x")[0]["free"], value.float())
 
 
 @pytest.mark.parametrize(
@@ -59,13 +59,13 @@ def test_doubles_and_strided_tensors_are_stored_as_floats_row_by_row() -> None:
 )
 def test_crafted_blocks(payload: bytes, message: str) -> None:
     with pytest.raises(StreamError, match=message):
-        unpack_raw_blocks(payload, 0, where="Packet 3")
+        unpack_blocks(payload, 0, where="Packet 3")
 
 
 @given(st.binary(max_size=80))
 def test_arbitrary_bytes_give_tensors_or_one_kind_of_error(payload: bytes) -> None:
     try:
-        found = unpack_raw_blocks(payload, 0, where="Packet 3")
+        found, _ = unpack_blocks(payload, 0, where="Packet 3")
     except StreamError:
         return
     assert sum(value.numel() for value in found.values()) * 4 <= len(payload)

@@ -63,7 +63,7 @@ def test_by_index_packets_are_not_read() -> None:
     data = Counted(STREAM)
     index = read_index(data, START)
     assert index is not None
-    assert [*index.offsets] == [offset for _, _, offset in ENTRIES]
+    assert [*index[0]] == [offset for _, _, offset in ENTRIES]
     assert data.read < 200 < min(len(record.payload) for record in RECORDS[1:5])
 
 
@@ -73,7 +73,7 @@ def test_records_of_unknown_types_lie_between_packets() -> None:
     data = with_index(body + STREAM[RECORDS[2].offset : RECORDS[5].offset], moved)
     index = read_index(data, START)
     assert index is not None
-    assert [*index.offsets] == [offset for _, _, offset in moved]
+    assert [*index[0]] == [offset for _, _, offset in moved]
 
 
 BODY = STREAM[: RECORDS[5].offset]

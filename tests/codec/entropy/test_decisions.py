@@ -13,14 +13,12 @@ from structgstream.codec.entropy.decisions import (
     NUMBER_NODES,
     ArithmeticState,
     Model,
-    Models,
     code_activity,
     code_numbers,
     code_residuals,
     residual_contexts,
 )
 from structgstream.codec.entropy.rans import has_native
-from structgstream.errors import StreamError
 from tests.support.properties import examples
 
 NATIVE = [False, *([True] if has_native() else [])]
@@ -146,24 +144,3 @@ def test_squash_and_stretch_belong_together() -> None:
     assert logits == sorted(logits)
     for i in range(4096):
         assert abs(reference.squashed(logits[i]) - 16 * i - 8) <= 70 or i in (0, 1, 4094, 4095)
-
-
-def test_a_model_of_others_is_a_copy() -> None:
-    first = Models()
-    first.get("a.b", [2], nodes=1).chances[:] = 5
-    second = Models(first)
-    second.get("a.b", [2], nodes=1).chances[:] = 7
-    assert first.get("a.b", [2], nodes=1).chances.tolist() == [[5], [5]]
-    assert second.all()["a.b"].chances.tolist() == [[7], [7]]
-
-
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
-def test_a_model_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(StreamError, match="do not fit their models"):
-        code_numbers(
-            ArithmeticState(None),
-            Model.new([1, 1], nodes=NUMBER_NODES),
-            contexts=np.zeros((1, 2), np.int32),
-            values=np.zeros(1, np.int64),
-            native=True,
-        )

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy import rans
-from structgstream.codec.entropy.bits import fixed, pack_bits, unpack_numbers, varint
+from structgstream.codec.entropy.bits import varint
 from structgstream.codec.entropy.rans import (
     LANES,
     SectionDecoder,
@@ -19,9 +19,8 @@ from structgstream.codec.entropy.rans import (
     encode,
     has_native,
     lanes_for,
-    section_bytes,
 )
-from structgstream.codec.entropy.tables import FrequencyTables, normalize_counts
+from structgstream.codec.entropy.tables import FrequencyTables, geometric_family, normalize_counts
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 
@@ -61,8 +60,9 @@ def counted(symbols: np.ndarray, context: np.ndarray, *, contexts: int, alphabet
 def test_symbols_come_back(native, seed, count, contexts, alphabet, lanes, even) -> None:
     symbols, context, tables = drawn(seed, count=count, contexts=contexts, alphabet=alphabet, even=even)
     data = encode(symbols, context, tables, lanes=lanes, native=native)
-    assert (decode(data, context, tables, native=native) == symbols).all()
-    assert section_bytes(data + b"more") == len(data)
+    found, end = decode(data + b"more", context, tables, native=native)
+    assert (found == symbols).all()
+    assert end == len(data)
 
 
 @both
@@ -74,7 +74,8 @@ def test_any_table_codes_what_it_has_a_frequency_for(native, data: st.DataObject
     possible = np.flatnonzero(tables.rows[0]).tolist()
     symbols = np.array(data.draw(st.lists(st.sampled_from(possible), max_size=80)), np.uint8)
     context = np.zeros(len(symbols), np.uint16)
-    assert (decode(encode(symbols, context, tables, native=native), context, tables, native=native) == symbols).all()
+    found, _ = decode(encode(symbols, context, tables, native=native), context, tables, native=native)
+    assert (found == symbols).all()
 
 
 @pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
@@ -84,7 +85,8 @@ def test_both_coders_write_the_same_bytes_and_read_each_other(count: int, lanes:
     symbols, context, tables = drawn(count, count=count, contexts=50)
     data = encode(symbols, context, tables, lanes=lanes, native=True)
     assert data == encode(symbols, context, tables, lanes=lanes, native=False)
-    assert (decode(data, context, tables, native=True) == decode(data, context, tables, native=False)).all()
+    one, other = (decode(data, context, tables, native=native)[0] for native in (True, False))
+    assert (one == other).all()
 
 
 @both
@@ -94,7 +96,7 @@ def test_the_bytes_are_those_of_the_document(native) -> None:
     symbols, context = np.array([0, 1, 0, 0], np.uint8), np.array([0, 0, 1, 1], np.uint16)
     data = encode(symbols, context, tables, native=native)
     assert data == bytes.fromhex("04 04  00 B8 97 00  01 50")
-    assert decode(data, context, tables, native=native).tolist() == [0, 1, 0, 0]
+    assert decode(data, context, tables, native=native)[0].tolist() == [0, 1, 0, 0]
 
 
 def test_a_certain_symbol_costs_nothing() -> None:
@@ -105,7 +107,7 @@ def test_a_certain_symbol_costs_nothing() -> None:
 def test_no_symbols_are_one_byte() -> None:
     nothing = np.empty(0, np.uint8), np.empty(0, np.uint16), FrequencyTables(np.array([[4096]], np.uint16))
     assert encode(*nothing) == b"\0"
-    assert len(decode(b"\0", *nothing[1:])) == 0
+    assert len(decode(b"\0", *nothing[1:])[0]) == 0
 
 
 def test_a_section_takes_more_lanes_as_it_grows() -> None:
@@ -117,16 +119,12 @@ def test_a_section_takes_more_lanes_as_it_grows() -> None:
 
 
 @both
-def test_every_cut_and_everything_behind_it_is_refused(native) -> None:
+def test_every_cut_is_refused(native) -> None:
     symbols, context, tables = drawn(5, count=100)
     data = encode(symbols, context, tables)
     for end in range(len(data)):
         with pytest.raises(StreamError, match=r"damaged|cut"):
             decode(data[:end], context, tables, native=native)
-        with pytest.raises(StreamError, match=r"damaged|cut"):
-            section_bytes(data[:end])
-    with pytest.raises(StreamError, match="but states"):
-        decode(data + b"\0", context, tables, native=native)
 
 
 @both
@@ -142,9 +140,9 @@ def test_arbitrary_states_and_words_never_do_harm(native, count: int, lanes: int
     words = data.draw(st.binary(min_size=2 * word_count, max_size=2 * word_count))
     _, context, tables = drawn(count, count=count)
     section = bytes([count, word_count << 2 | lanes]) + states[: 4 * LANES[lanes]] + words
-    assert section_bytes(section) == len(section)
     with suppress(StreamError):
-        assert decode(section, context, tables, native=native).shape == (count,)
+        found, end = decode(section, context, tables, native=native)
+        assert (found.shape, end) == ((count,), len(section))
 
 
 @both
@@ -154,13 +152,13 @@ def test_arbitrary_bytes_are_refused_or_decode(native, data: bytes) -> None:
     _, context, tables = drawn(6, count=20)
     for count in {0, 1, 20, min(data[0], 20) if data else 0}:
         with suppress(StreamError):
-            assert len(decode(data, context[:count], tables, native=native)) == count
+            assert len(decode(data, context[:count], tables, native=native)[0]) == count
 
 
 @pytest.mark.parametrize(
     ("head", "problem"),
     [
-        (b"\xff\xff\xff\xff\xff", "first bytes"),
+        (b"\xff\xff\xff\xff\xff", "cut or beyond 32 bits"),
         (b"\xff\xff\xff\xff\x0f\x00", "damaged"),  # 2^32 - 1 symbols
         (b"\x14\xfc\xff\xff\xff\x0f", "damaged"),  # more words than symbols
         (b"\x14\x03", "damaged"),  # the lane code that means nothing
@@ -179,32 +177,9 @@ def test_what_a_head_states_is_checked_first(head: bytes, problem: str) -> None:
 def test_states_that_do_not_come_home_are_refused(native) -> None:
     tables = FrequencyTables(np.array([[4096]], np.uint16))
     context = np.zeros(20, np.uint16)
-    assert decode(b"\x14\x00" + struct.pack("<I", 1 << 16), context, tables, native=native).tolist() == [0] * 20
+    assert decode(b"\x14\x00" + struct.pack("<I", 1 << 16), context, tables, native=native)[0].tolist() == [0] * 20
     with pytest.raises(StreamError, match="contradict"):
         decode(b"\x14\x00" + struct.pack("<I", (1 << 16) + 1), context, tables, native=native)
-
-
-def test_an_encoder_is_reported_what_does_not_fit() -> None:
-    tables = FrequencyTables(np.array([[4095, 1, 0]], np.uint16))
-    zero = np.zeros(2, np.uint16)
-    cases: list[tuple[list[int], np.ndarray, str]] = [
-        ([0, 2], zero, "has frequency 0"),
-        ([0, 3], zero, "has frequency 0"),
-        ([0], zero, "one for each"),
-        ([0, 0], zero + 1, "Context 1 has no table"),
-        ([0, 0], zero.astype(np.int64), "must be uint16"),
-    ]
-    for symbols, context, problem in cases:
-        with pytest.raises(StreamError, match=problem):
-            encode(np.array(symbols, np.uint8), context, tables)
-    with pytest.raises(StreamError, match="Context 1 has no table"):
-        decode(b"\x02\x00", np.ones(2, np.uint16), tables)
-
-
-def test_lanes_other_than_the_formats_are_refused() -> None:
-    symbols, context, tables = drawn(1, count=20)
-    with pytest.raises(StreamError, match="1, 4 or 32 lanes"):
-        encode(symbols, context, tables, lanes=2)
 
 
 def test_without_the_native_library_numpy_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,13 +187,11 @@ def test_without_the_native_library_numpy_does_it(monkeypatch: pytest.MonkeyPatc
     data = encode(symbols, context, tables)
     monkeypatch.setattr(rans, "native_reason", lambda: "none")
     assert encode(symbols, context, tables) == data
-    assert (decode(data, context, tables) == symbols).all()
-    with pytest.raises(StreamError, match="no entropy coder"):
-        decode(data, context, tables, native=True)
+    assert (decode(data, context, tables)[0] == symbols).all()
 
 
 NATURAL = st.one_of(st.integers(0, 20), st.integers(0, 2**31 - 1), st.sampled_from([2**30 - 1, 2**30, 2**31 - 1]))
-RESIDUAL = st.one_of(st.integers(-9, 9), st.integers(-(2**31), 2**31 - 1))
+RESIDUAL = st.integers(-7, 7)
 
 
 def contexts_for(values: list, count: int) -> np.ndarray:
@@ -254,24 +227,15 @@ def test_what_is_left_over_is_reported() -> None:
         reader(writer.fields).end()
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"\xff\xff\xff\xff\x10", "beyond 32 bits"),
-        (b"\x80\x80\x80\x80\x80\x01", "beyond 32 bits"),
-        (b"\x80", "ends 1 bytes too early in one"),
-        (b"", "ends 1 bytes too early in one"),
-    ],
-)
-def test_a_number_that_is_none(data: bytes, message: str) -> None:
-    with pytest.raises(StreamError, match=message):
-        reader({"one": data}).number("one.count", None)
-
-
-def test_numbers_have_seven_bits_a_byte() -> None:
-    assert [varint(n) for n in (0, 127, 128, 2**32 - 1)] == [b"\0", b"\x7f", b"\x80\x01", b"\xff\xff\xff\xff\x0f"]
-    for n in (0, 1, 127, 128, 300, 2**28 - 1, 2**28, 2**32 - 1):
-        assert reader({"one": varint(n)}).number("one.count", None) == n
+def test_residuals_that_have_no_symbol_are_refused() -> None:
+    """An escape, which the format once foresaw, and bytes of one (docs/bitstream.md, Coded init fields)."""
+    table = b"\x02\xb7\x80"  # symbols of context 0 by row 222 of the family
+    for symbol, more in ((15, 0), (14, 1)):
+        tables = FrequencyTables(geometric_family(16)[[222]])
+        section = encode(np.array([symbol], np.uint8), np.zeros(1, np.uint16), tables)
+        data = table + section + varint(more)
+        with pytest.raises(StreamError, match=r"Packet 0, one\.step, holds a residual beyond 7"):
+            reader({"one": data}).residuals("one.step", None, np.zeros(1, np.uint16), count=1)
 
 
 @pytest.mark.parametrize("value", [-1, 2**31])
@@ -287,22 +251,3 @@ def test_tables_persist() -> None:
     first = len(encoder.fields["one"])
     encoder.residuals("one.step", values, nothing, count=1)
     assert len(encoder.fields["one"]) < 2 * first, "the table is known by then"
-
-
-@examples(100)
-@given(st.lists(st.tuples(st.integers(0, 56), st.integers(0, 2**56 - 1)), max_size=40))
-def test_numbers_are_found_at_any_bit(pairs: list[tuple[int, int]]) -> None:
-    values = [value % (1 << width) for width, value in pairs]
-    widths = np.array([width for width, _ in pairs], np.int64)
-    data = pack_bits(fixed(value, width) for value, (width, _) in zip(values, pairs) if width)
-    assert unpack_numbers(data, widths, where="").tolist() == values
-    with pytest.raises(StreamError, match="It has .* bytes for .* bits of numbers"):
-        unpack_numbers(data + b"\0", widths, where="It")
-
-
-def test_what_stands_behind_the_last_number_must_be_zero() -> None:
-    """Every file that says the same is the same."""
-    assert unpack_numbers(b"\xa0", np.array([3]), where="").tolist() == [5]
-    for data in (b"\xa1", b"\xb0", b""):
-        with pytest.raises(StreamError, match="damaged"):
-            unpack_numbers(data, np.array([3]), where="It")

@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compact codec from scene to file and back."""
 
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 import torch
 
-from structgstream.codec.container.blocks import coded_payloads
-from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
+from structgstream.codec.container.blocks import unpack_blocks
+from structgstream.codec.container.records import FRAME, scan_records
 from structgstream.codec.fields.packet_fields import CODABLE
 from structgstream.codec.packets import (
     Packet,
@@ -33,7 +30,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, flatten_head, scene_of, state_of
 from tests.support.properties import thinned
 from tests.support.rigs import random_scene
-from tests.support.streams import STATIC_STEP, STEPS, compact_header, same, small_scene
+from tests.support.streams import STATIC_STEP, compact_header, same, small_scene
 
 FREE: frozenset[FieldName] = frozenset({"free", "free_births"})
 DYNAMICS: list[frozenset[FieldName]] = [
@@ -179,24 +176,6 @@ def test_what_stands_still_keeps_its_bins_and_costs_next_to_nothing() -> None:
     assert same(again[1], seen[0])
 
 
-def test_bytes_of_each_field_add_up() -> None:
-    _, data, _, packets = small()
-    reader = StreamReader(data)
-    for packet, info in zip(packets, reader.packets, strict=True):
-        assert info.field_bytes == packet.field_bytes
-        assert info.field_bytes.keys() == PAPER_DYNAMIC
-        assert sum(packet.field_bytes.values()) + 12 == len(packet.payload)
-
-
-def test_the_header_comes_back() -> None:
-    header = compact_header(small_scene(3, free=2), steps={name: float(np.float32(0.013)) for name in STEPS})
-    back = unpack_header(pack_header(header))
-    assert (back.codec, back.steps, back.dynamic) == ("compact", header.steps, header.dynamic)
-    assert back.reference.keys() == {"anchor_positions", "offset_scales", "covariance_mlp"}
-    assert all(torch.equal(back.reference[name], value) for name, value in header.reference.items())
-    assert back.static.keys() == header.static.keys()
-
-
 def without(header: StreamHeader, name: str) -> dict[str, float]:
     return {key: step for key, step in header.steps.items() if key != name}
 
@@ -247,25 +226,6 @@ def test_a_raw_block_in_a_compact_packet_and_the_other_way_round() -> None:
         SceneDecoder(raw).decode(packets[0])
 
 
-def mended(data: bytes) -> bytes:
-    """The stream with right checksums, wherever the records' heads still stand."""
-    out, start = bytearray(data), 12
-    while start + RECORD.size + 4 <= len(out):
-        end = start + RECORD.size + RECORD.unpack_from(out, start)[3]
-        if end + 4 > len(out):
-            break
-        struct.pack_into("<I", out, end, zlib.crc32(out[start:end]))
-        if out[start] == RecordType.INDEX:
-            break
-        start = end + 4
-    return bytes(out)
-
-
-def test_mending_leaves_a_good_stream_as_it_is() -> None:
-    data = small()[1]
-    assert mended(data) == data
-
-
 def flipped(data: bytes, places: Sequence[int]) -> Iterator[bytes]:
     """One bit of each of these bytes changed."""
     for at in places:
@@ -278,13 +238,13 @@ def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index
     header, _, seen, packets = small()
     decoder = CompactCoder(header)
     for packet in packets[(index // 3) * 3 : index]:
-        decoder.decode(coded_payloads(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
+        decoder.decode(unpack_blocks(packet.payload, FRAME.size, where="")[1], kind=packet.kind, index=packet.index)
     state, failed, different = decoder.state, 0, 0
     for payload in flipped(packets[index].payload, range(FRAME.size, len(packets[index].payload))):
         decoder.state = state
         try:
             packet = parse_packet(payload, packets[index].kind)
-            found = decoder.decode(coded_payloads(payload, FRAME.size, where=""), kind=packet.kind, index=index)
+            found = decoder.decode(unpack_blocks(payload, FRAME.size, where="")[1], kind=packet.kind, index=index)
         except StreamError:
             failed += 1
             continue

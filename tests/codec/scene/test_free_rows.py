@@ -155,3 +155,11 @@ def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> No
     more = FreeBins(np.arange(1, 2**12 + 2), np.zeros((2**12 + 1, 14), np.int32), many.change)
     with pytest.raises(StreamError, match="adds 1 free Gaussians, which makes more than"):
         code_free(new_encoder(), more, many, where="Frame 1")
+
+
+def test_rows_that_stay_keep_their_change_and_new_ones_have_none() -> None:
+    residuals = np.array([[0, 0], [1, -2], [300, 300], [0, -1]], np.int32)
+    change = Change.of(residuals).select(np.array([False, True, False, True])).extended(2)
+    assert change.residuals.tolist() == [[1, -2], [0, -1], [0, 0], [0, 0]]
+    assert change.history.tolist() == [1, 1, 0, 0]
+    assert change.sizes.tolist() == [3, 1, 0, 0]

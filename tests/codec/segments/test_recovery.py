@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.codec.container.records import RecordType, packed
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, Window, manifest_to_json
-from structgstream.codec.segments.recovery import find, stale_files
+from structgstream.codec.segments.recovery import find, part_of, stale_files
 from structgstream.codec.segments.store import FolderStore
 from structgstream.errors import StreamError
 from tests.support.segment_folders import GrowingFolder
@@ -47,6 +48,14 @@ class Left:
         assert draft is not None
         assert [len(record) for record in draft.records] == [part.bytes for part in draft.manifest.parts]
         return draft.manifest
+
+
+@pytest.mark.parametrize("kind", [RecordType.INIT, RecordType.INDEX, RecordType.KEY])
+def test_what_is_no_packet_is_no_part(kind: RecordType) -> None:
+    data = packed(kind, bytes(11 if kind is RecordType.KEY else 13))
+    for content in (data, packed(RecordType.KEY, bytes(12))[:-1], b""):
+        with pytest.raises(StreamError, match=f"^{len(content)} bytes are no whole record of a packet"):
+            part_of(content)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 4, 7])

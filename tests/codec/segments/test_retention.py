@@ -46,19 +46,11 @@ def there(store: FolderStore) -> list[int]:
     return [number for number in range(8) if segment(number).file in store.names()]
 
 
-def publish(retention: Retention, named: Manifest, *leaving: str) -> Manifest:
+def publish(retention: Retention, named: Manifest) -> Manifest:
     """The manifest with its window, once it is written."""
-    turnover = retention.turnover(named)
-    named = replace(named, window=turnover.window)
-    retention.published(named, turnover, leaving)
+    named = replace(named, window=retention.window(named))
+    retention.published(named)
     return named
-
-
-def test_without_a_window_everything_stays(store: FolderStore) -> None:
-    retention = Retention(store, SegmentsOptions(grace_seconds=0.0), lambda: 0.0)
-    for segments in range(1, 8):
-        assert publish(retention, manifest(segments)).window.first_segment == 0
-    assert there(store) == [*range(8)]
 
 
 def test_a_segment_leaves_the_window_at_once_and_the_store_after_the_time_of_grace(store: FolderStore) -> None:
@@ -73,43 +65,6 @@ def test_a_segment_leaves_the_window_at_once_and_the_store_after_the_time_of_gra
     now[0] = 5.0
     publish(retention, manifest(6, periods=periods, after=last))
     assert there(store) == [4, 5, 6, 7], "a period begins at segment 4, so that nothing needs segment 0"
-
-
-def test_a_period_that_ends_with_the_first_manifest_after_resuming_leaves_the_store(store: FolderStore) -> None:
-    store.put(FIRST.file, b"")
-    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), lambda: 0.0)
-    retention.take_up(manifest(6, periods=(FIRST, SECOND)))
-    publish(retention, manifest(6, periods=(SECOND,)))
-    assert FIRST.file not in store.names()
-
-
-def test_the_segment_that_resuming_needs_stays(store: FolderStore) -> None:
-    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), lambda: 0.0)
-    last = None
-    for segments in range(1, 7):
-        last = publish(retention, manifest(segments, after=last))
-    assert there(store) == [0, 4, 5, 6, 7]
-
-
-def test_a_file_that_is_written_again_stays(store: FolderStore) -> None:
-    now = [0.0]
-    retention = Retention(store, SegmentsOptions(grace_seconds=5.0), lambda: now[0])
-    publish(retention, manifest(1), segment(6).file, segment(7).file)
-    retention.written(segment(7).file)
-    now[0] = 9.0
-    publish(retention, manifest(1))
-    assert there(store) == [0, 1, 2, 3, 4, 5, 7]
-
-
-def test_what_a_manifest_that_is_taken_up_does_not_name_leaves(store: FolderStore) -> None:
-    now = [0.0]
-    retention = Retention(store, SegmentsOptions(grace_seconds=5.0), lambda: now[0])
-    retention.take_up(manifest(3))
-    publish(retention, manifest(3))
-    assert there(store) == [*range(8)]
-    now[0] = 5.0
-    publish(retention, manifest(3))
-    assert there(store) == [0, 1, 2]
 
 
 def test_what_a_stream_that_is_taken_up_needed_goes_when_another_period_runs(store: FolderStore) -> None:

@@ -202,6 +202,15 @@ def test_the_window_and_what_has_left_it(tmp_path: Path) -> None:
         archived(store)
 
 
+def test_a_group_that_is_opened_again_stays_in_a_window_shorter_than_a_frame(tmp_path: Path) -> None:
+    """Its segment was closed early, and its end has left the window; its frames are parts again."""
+    store, options, hands = folder(tmp_path), SegmentsOptions(window_seconds=0.01, grace_seconds=0.0), Hands()
+    written(store, SENT[:5], options=options, hands=hands)
+    windows = []
+    written(store, SENT, options=options, hands=hands, after=lambda _: windows.append(read_manifest(store).window))
+    assert [(one.first_segment, one.first_frame) for one in windows] == [(1, 3), (2, 6), (2, 6)]
+
+
 def test_a_stream_with_a_window_is_continued_with_all_its_sizes(tmp_path: Path) -> None:
     sent = packets(180)
     whole, stopped = folder(tmp_path / "whole"), folder(tmp_path / "stopped")

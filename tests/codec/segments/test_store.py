@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
 
@@ -61,10 +62,12 @@ def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
         FolderStore(tmp_path / "stream").names()
 
 
-def test_names_of_the_sink_are_known() -> None:
-    sixteen = "0123456789abcdef"
-    ours = [f"part-00000012-{sixteen}.sgs", f"init-0000-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
-    assert all(map(is_ours, [*ours, f"segment-123456789-{sixteen}.sgs", "manifest.json"]))
+def test_names_of_the_sink_are_those_of_the_document_and_known() -> None:
+    sixteen, digest = "0123456789abcdef", "0123456789abcdef" + "0" * 48
+    ours = [init_name(0, digest), part_name(12, digest), segment_name(123456789, digest), history_name(0, digest)]
+    assert ours[:2] == [f"init-0000-{sixteen}.sgs", f"part-00000012-{sixteen}.sgs"]
+    assert ours[2:] == [f"segment-123456789-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
+    assert all(map(is_ours, [*ours, "manifest.json"]))
     assert not any(map(is_ours, ["notes.txt", "part-1.sgs", f"x{ours[0]}", f"{ours[0]}x", f"{ours[0]}\n", ".new-x"]))
 
 

@@ -92,18 +92,6 @@ def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[B
         start = end
 
 
-def unpack_raw_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName, Tensor]:
-    """The tensors of all blocks from byte ``start`` to the end, which must be raw.
-
-    Raises:
-        StreamError: as :func:`iterate_blocks`, or a block is coded.
-    """
-    values, coded = unpack_blocks(payload, start, where=where)
-    if coded:
-        raise StreamError(f"{where} holds field {next(iter(coded))} coded; expected raw.")
-    return values
-
-
 def unpack_blocks(
     payload: bytes, start: int, *, where: str
 ) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
@@ -120,18 +108,6 @@ def unpack_blocks(
         else:
             coded[block.name] = memoryview(payload)[block.data : block.end]
     return values, coded
-
-
-def coded_payloads(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
-    """The bytes of all blocks from byte ``start`` to the end, which must be coded.
-
-    Raises:
-        StreamError: as :func:`iterate_blocks`, or a block is raw.
-    """
-    values, coded = unpack_blocks(payload, start, where=where)
-    if values:
-        raise StreamError(f"{where} holds field {next(iter(values))} raw; expected coded.")
-    return coded
 
 
 def _numbers(payload: bytes, block: Block) -> Tensor:

@@ -194,14 +194,6 @@ def period_at(periods: Sequence[Period], frame: int) -> int:
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 
 
-@dataclass(frozen=True)
-class Index:
-    """What an index says."""
-
-    offsets: "array[int]"  # of packets, by frame
-    periods: tuple[Period, ...]  # those after the first
-
-
 def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
     """Index record, to be written at byte ``offset``, and footer. Entries are frame index, record type and offset of
     each packet, and of each init record after the first."""
@@ -214,8 +206,9 @@ def indexed_frames(payload: bytes) -> int:
     return sum(kind != RecordType.INIT for _, kind, _ in INDEX_ENTRY.iter_unpack(payload))
 
 
-def read_index(data: ByteSource, start: int, *, period: int = 0) -> Index | None:
-    """Offsets, from the index, of the packets after the first init record, of ``period``, which ends at ``start``.
+def read_index(data: ByteSource, start: int, *, period: int = 0) -> "tuple[array[int], list[Period]] | None":
+    """Offsets, from the index, of the packets after the first init record, of ``period``, which ends at ``start``; and
+    the periods after that one.
 
     None if the stream must be scanned: footer or index is damaged, or disagrees with the heads of the records.
     """
@@ -232,7 +225,7 @@ def read_index(data: ByteSource, start: int, *, period: int = 0) -> Index | None
         start += head.bytes
     if start != end or heads.pending is not None or heads.entries != index.payload:
         return None
-    return Index(heads.offsets, tuple(heads.periods))
+    return heads.offsets, heads.periods
 
 
 class _Heads:

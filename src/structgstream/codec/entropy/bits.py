@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integers as bits, and residuals as symbols with escapes (docs/entropy.md, sections Bits and Escapes)."""
+"""Integers as bits and bytes (docs/entropy.md, section Bits)."""
 
 from collections.abc import Iterable
 from typing import TypeVar
@@ -28,15 +28,11 @@ def fixed(value: int, width: int) -> str:
     return f"{value:0{width}b}"
 
 
-def golomb(value: int, *, order: int) -> str:
-    """Exp-Golomb: the binary digits of ``value + 2^order``, after one zero for each digit beyond ``order + 1``."""
-    digits = f"{value + (1 << order):b}"
-    return "0" * (len(digits) - order - 1) + digits
-
-
 def signed_golomb(value: int, *, order: int) -> str:
-    """Exp-Golomb of the index of ``value`` in 0, -1, 1, -2, 2 ..."""
-    return golomb(zigzag(value), order=order)
+    """Exp-Golomb of the index ``i`` of ``value`` in 0, -1, 1, -2, 2 ...: the binary digits of ``i + 2^order``, after
+    one zero for each digit beyond ``order + 1``."""
+    digits = f"{zigzag(value) + (1 << order):b}"
+    return "0" * (len(digits) - order - 1) + digits
 
 
 def varint(value: int) -> bytes:
@@ -46,6 +42,17 @@ def varint(value: int) -> bytes:
         out.append(value & 127 | 128)
         value >>= 7
     return bytes([*out, value])
+
+
+def read_varint(data: bytes | memoryview, start: int = 0, *, where: str) -> tuple[int, int]:
+    """The number that :func:`varint` wrote at byte ``start``, and where it ends. Raises StreamError if it is cut, or
+    beyond 32 bits."""
+    value = 0
+    for place, byte in enumerate(data[start : start + 5]):
+        value |= (byte & 127) << 7 * place
+        if byte < 128 and value < 2**32:
+            return value, start + place + 1
+    raise StreamError(f"{where} holds a number that is cut or beyond 32 bits; it is damaged.")
 
 
 def zigzag(values: Whole) -> Whole:
@@ -95,67 +102,17 @@ class BitReader:
         self._position = end
         return value
 
-    def golomb(self, *, order: int, max_zeros: int) -> int:
-        """An Exp-Golomb code with at most ``max_zeros`` leading zeros. Raises StreamError if it has more, or is
-        truncated."""
+    def signed_golomb(self, *, order: int, max_zeros: int) -> int:
+        """What :func:`signed_golomb` wrote, with at most ``max_zeros`` leading zeros. Raises StreamError if it has
+        more, or is truncated."""
         first = self._text.find("1", self._position, self._position + max_zeros + 1)
         if first < 0:
             raise StreamError(f"{self._where} holds a number that is cut or out of bounds; it is damaged.")
         zeros, self._position = first - self._position, first
-        return self.fixed(zeros + order + 1) - (1 << order)
-
-    def signed_golomb(self, *, order: int, max_zeros: int) -> int:
-        """A signed Exp-Golomb code, see :func:`signed_golomb`.
-
-        Raises:
-            StreamError: as :meth:`golomb`.
-        """
-        return unzigzag(self.golomb(order=order, max_zeros=max_zeros))
+        return unzigzag(self.fixed(zeros + order + 1) - (1 << order))
 
     def end(self) -> None:
         """Checks that only zero padding of the last byte is left. Raises StreamError if more is left."""
         rest = self._text[self._position :]
         if len(rest) > 7 or "1" in rest:
             raise StreamError(f"{self._where} goes on after its last number; it is damaged.")
-
-
-ALPHABET = 16
-LARGEST_SYMBOL = 7
-ESCAPE = 15
-_ORDER = 2
-_MAX_ZEROS = 28
-
-
-def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
-    """Symbols u8 ``[n]`` of residuals ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others'
-    values. Raises StreamError if a residual is out of int32's range."""
-    values = residuals.astype(np.int64)
-    if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
-        raise StreamError("A residual is beyond 32 bits; take a larger quantization step.")
-    size = np.abs(values)
-    symbols = np.where(size > LARGEST_SYMBOL, ESCAPE, zigzag(values)).astype(np.uint8)
-    large = values[size > LARGEST_SYMBOL].tolist()
-    return symbols, pack_bits(golomb(abs(v) - LARGEST_SYMBOL - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
-
-
-def symbols_to_residuals(
-    symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
-) -> NDArray[np.int32]:
-    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``. Raises StreamError if a symbol is above 15, the
-    number of values differs from that of escapes, or a value is beyond 32 bits."""
-    if (symbols > ESCAPE).any():
-        raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
-    values = unzigzag(symbols.astype(np.int64))
-    places = np.flatnonzero(symbols == ESCAPE)
-    # An escape takes 4 to 61 bits.
-    if not 4 * len(places) <= 8 * len(escapes) <= 61 * len(places) + 7:
-        raise StreamError(f"{where} has {len(escapes)} bytes for {len(places)} values; it is damaged.")
-    reader = BitReader(escapes, where=where)
-    for place in places:
-        magnitude = reader.golomb(order=_ORDER, max_zeros=_MAX_ZEROS) + LARGEST_SYMBOL + 1
-        negative = reader.fixed(1)
-        if magnitude > 2**31 - 1 + negative:
-            raise StreamError(f"{where} holds a value beyond 32 bits; it is damaged.")
-        values[place] = -magnitude if negative else magnitude
-    reader.end()
-    return values.astype(np.int32)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.entropy.rans import uses_native
-from structgstream.errors import OutOfMemoryError, StreamError
+from structgstream.errors import OutOfMemoryError
 from structgstream.kernels.native import native_library
 
 HALF = 1 << 15
@@ -313,12 +313,8 @@ class _Coder:
 
 
 def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model], *given: int | np.ndarray) -> bool:
-    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds.
-
-    Raises:
-        OutOfMemoryError: there is not enough memory.
-        StreamError: a model has the wrong shape.
-    """
+    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds. Raises
+    OutOfMemoryError if there is not enough memory."""
     state, arguments = arithmetic.native(), list[int]()
     for value in given:
         if isinstance(value, np.ndarray):
@@ -330,8 +326,7 @@ def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model]
     arithmetic.take(state)
     if result == _NO_MEMORY:
         raise OutOfMemoryError("to code decisions")
-    if result > _DAMAGED:
-        raise StreamError("Decisions to code do not fit their models.")
+    assert result <= _DAMAGED, "decisions fit their models"
     return not result
 
 

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.entropy.bits import (
-    ALPHABET,
     Bins,
     Contexts,
     Naturals,
     bit_lengths,
     fixed,
     pack_bits,
-    residuals_to_symbols,
-    symbols_to_residuals,
+    read_varint,
     unpack_numbers,
+    unzigzag,
     varint,
+    zigzag,
 )
 from structgstream.codec.entropy.tables import (
     COST_BITS,
@@ -93,7 +93,6 @@ def decode_lanes(
     return symbols if position == len(words) and (x == LOW).all() else None
 
 
-MAX_SYMBOLS = 2**31 - 1
 LANES = (1, 4, 32)
 """Number of lanes, by the code in a section's head."""
 
@@ -129,18 +128,7 @@ def encode(
         contexts: u16 ``[n]``, each below C.
         lanes: 1, 4 or 32; None takes :func:`lanes_for`.
         native: C++ or NumPy, which give the same bytes; None takes C++ if available.
-
-    Raises:
-        StreamError: symbols, contexts and tables are inconsistent.
     """
-    contexts = _checked_contexts(contexts, tables)
-    symbols = np.ascontiguousarray(symbols, np.uint8)
-    if symbols.shape != contexts.shape:
-        raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
-    if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
-        raise StreamError("A symbol to encode has frequency 0 in its context; count it before making the tables.")
-    if lanes is not None and lanes not in LANES:
-        raise StreamError(f"Sections have 1, 4 or 32 lanes, not {lanes}.")
     if not len(symbols):
         return varint(0)
     lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
@@ -157,73 +145,38 @@ def decode(
     *,
     where: str = "A section of symbols",
     native: bool | None = None,
-) -> NDArray[np.uint8]:
-    """The symbols u8 ``[n]`` of a section that fills ``data``, with the contexts u16 ``[n]`` of its encoding. Raises
-    StreamError if the section is damaged, or states another number of symbols."""
-    contexts = _checked_contexts(contexts, tables)
-    count, word_count, lanes, start = _head(data, where=where)
+) -> tuple[NDArray[np.uint8], int]:
+    """The symbols u8 ``[n]`` of the section at the start of ``data``, with the contexts u16 ``[n]`` of its encoding,
+    and where the section ends. Raises StreamError if it is damaged, or states another number of symbols."""
+    count, start = read_varint(data, where=where)
     if count != len(contexts):
         raise StreamError(f"{where} states {count} symbols, {len(contexts)} are expected; it is damaged.")
-    if start + 4 * lanes + 2 * word_count != len(data):
-        raise StreamError(f"{where} has {len(data)} bytes, but states {word_count} words; it is damaged.")
-    if not lanes:
-        return np.empty(0, np.uint8)
+    if not count:
+        return np.empty(0, np.uint8), start
+    value, start = read_varint(data, start, where=where)
+    word_count, lane_code = value >> 2, value & 3
+    # A symbol takes at most one word.
+    if word_count > count or lane_code >= len(LANES):
+        raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
+    lanes = LANES[lane_code]
+    end = start + 4 * lanes + 2 * word_count
+    if end > len(data):
+        raise StreamError(f"{where} states {end} bytes, {len(data)} are left; it is damaged.")
     states = np.frombuffer(data, "<u4", lanes, start).astype(np.uint32)
     words = np.frombuffer(data, "<u2", word_count, start + 4 * lanes).astype(np.uint16)
     code = _native_decode if uses_native(native) else decode_lanes
     if (symbols := code(words, states, contexts, tables)) is None:
         raise StreamError(f"{where} is damaged: its words and final states contradict each other.")
-    return symbols
-
-
-def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbols") -> int:
-    """Length in bytes of the section at the start of ``data``, which may be longer. Raises StreamError if the section
-    is longer than the data."""
-    _, word_count, lanes, start = _head(data, where=where)
-    end = start + 4 * lanes + 2 * word_count
-    if end > len(data):
-        raise StreamError(f"{where} states {end} bytes, {len(data)} are left; it is damaged.")
-    return end
-
-
-def _head(data: bytes | memoryview, *, where: str) -> tuple[int, int, int, int]:
-    """Numbers of symbols, words and lanes, and the offset of the states."""
-    count, start = _read_varint(data, 0, where=where)
-    if count == 0:
-        return 0, 0, 0, start
-    value, start = _read_varint(data, start, where=where)
-    word_count, lane_code = value >> 2, value & 3
-    # A symbol takes at most one word.
-    if count > MAX_SYMBOLS or word_count > count or lane_code >= len(LANES):
-        raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
-    return count, word_count, LANES[lane_code], start
-
-
-def _read_varint(data: bytes | memoryview, start: int, *, where: str) -> tuple[int, int]:
-    value = 0
-    for place, byte in enumerate(bytes(data[start : start + 5])):
-        value |= (byte & 0x7F) << 7 * place
-        if byte < 0x80:
-            return value, start + place + 1
-    raise StreamError(f"{where} is cut or damaged in its first bytes.")
-
-
-def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> NDArray[np.uint16]:
-    if contexts.ndim != 1 or len(contexts) > MAX_SYMBOLS or contexts.dtype != np.uint16:
-        raise StreamError(f"Contexts must be uint16 [n], got {contexts.dtype} {contexts.shape}.")
-    if len(contexts) and int(contexts.max()) >= tables.contexts:
-        raise StreamError(f"Context {int(contexts.max())} has no table; there are {tables.contexts}.")
-    return np.ascontiguousarray(contexts)
+    return symbols, end
 
 
 def uses_native(native: bool | None) -> bool:
-    """Whether to use C++; None uses it if available. Raises StreamError if it is requested and not available."""
-    if native and not has_native():
-        raise StreamError("The installed native library has no entropy coder; install structgstream again.")
+    """Whether to use C++; None uses it if available."""
     return has_native() if native is None else native
 
 
 def _address(array: np.ndarray) -> int:
+    assert array.flags.c_contiguous
     return array.ctypes.data
 
 
@@ -243,8 +196,7 @@ def _native_encode(
     )
     if result == _NO_MEMORY:
         raise OutOfMemoryError("to encode symbols")
-    if result:
-        raise StreamError("Symbols to encode do not fit their tables.")
+    assert not result, "symbols, contexts and tables fit"
     return states, words[: word_count.value]
 
 
@@ -271,6 +223,9 @@ def _table_arguments(tables: FrequencyTables) -> tuple[int, int, int]:
     return _address(tables.rows), tables.contexts, tables.alphabet
 
 
+LARGEST_SYMBOL = 7
+ALPHABET = 16
+"""Symbols of residuals: 0 to 14 for 0, -1, 1, -2, 2 ... -7, 7. The last one, for larger residuals, is not used."""
 CLASSES = 32
 """Alphabet of the bit lengths of natural numbers below 2^31."""
 _FLAT = 128  # the geometric row that a context starts with
@@ -287,11 +242,11 @@ class SectionEncoder:
         self.fields: dict[str, bytes] = {}
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
-        """Small signed numbers ``[n]``: entropy-coded symbols from -7 to 7, escape codes for larger ones."""
+        """Signed numbers ``[n]`` from -7 to 7, entropy-coded, and the length of the larger ones' bytes, 0."""
         assert values is not None
-        symbols, escapes = residuals_to_symbols(values)
+        symbols = zigzag(values.astype(np.int64)).astype(np.uint8)
         self._section(name, symbols, contexts, count=count, alphabet=ALPHABET)
-        self._put(name, varint(len(escapes)) + escapes)
+        self.number(name, 0)
         return values
 
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
@@ -335,9 +290,9 @@ class SectionDecoder:
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         symbols = self._section(name, contexts, count=count, alphabet=ALPHABET)
-        return symbols_to_residuals(
-            symbols, self._taken(name, self.number(name, None)), where=f"{self._where}, {name},"
-        )
+        if self.number(name, None) or (symbols == ALPHABET - 1).any():
+            raise StreamError(f"{self._where}, {name}, holds a residual beyond {LARGEST_SYMBOL}; it is damaged.")
+        return unzigzag(symbols.astype(np.int64)).astype(np.int32)
 
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
         sizes = self._section(name, contexts, count=count, alphabet=CLASSES).astype(np.int64)
@@ -346,17 +301,8 @@ class SectionDecoder:
         return np.where(sizes > 0, (1 << widths) + rest, 0)
 
     def number(self, name: str, value: int | None) -> int:
-        found = shift = 0
-        while True:
-            (byte,) = self._taken(name, 1)
-            found |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                break
-            if shift > 28:
-                raise StreamError(f"{self._where}, {name}, holds a number beyond 32 bits; it is damaged.")
-        if found >= 2**32:
-            raise StreamError(f"{self._where}, {name}, holds a number beyond 32 bits; it is damaged.")
+        found, end = read_varint(self._left_of(name), where=f"{self._where}, {name},")
+        self._taken(name, end)
         return found
 
     def end(self) -> None:
@@ -368,12 +314,15 @@ class SectionDecoder:
         where = f"{self._where}, {name},"
         before = _last(self._tables, name, count, alphabet)
         self._tables[name] = decode_tables(self._taken(name, self.number(name, None)), before, where=where)
-        size = section_bytes(self._left[name.partition(".")[0]], where=where)
-        return decode(self._taken(name, size), contexts, self._tables[name], where=where)
+        symbols, end = decode(self._left_of(name), contexts, self._tables[name], where=where)
+        self._taken(name, end)
+        return symbols
+
+    def _left_of(self, name: str) -> memoryview:
+        return self._left.get(name.partition(".")[0], memoryview(b""))
 
     def _taken(self, name: str, size: int) -> memoryview:
-        field = name.partition(".")[0]
-        data = self._left.get(field, memoryview(b""))
+        field, data = name.partition(".")[0], self._left_of(name)
         if size > len(data):
             raise StreamError(f"{self._where} ends {size - len(data)} bytes too early in {field}; it is damaged.")
         self._left[field] = data[size:]

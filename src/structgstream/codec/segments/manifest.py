@@ -14,7 +14,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.errors import StreamError
@@ -172,19 +172,6 @@ LISTED_SEGMENTS = 8
 """The newest segments are always listed in the manifest itself."""
 
 
-class StoredFile(Protocol):
-    """What every entry states of its file."""
-
-    @property
-    def file(self) -> str: ...
-
-    @property
-    def bytes(self) -> int: ...
-
-    @property
-    def sha256(self) -> str: ...
-
-
 @dataclass(frozen=True)
 class Edge:
     """The newest frame."""
@@ -264,6 +251,9 @@ class PartEntry:
     pts_seconds: float
     bytes: int
     sha256: str
+
+
+StoredFile = PeriodEntry | SegmentEntry | HistoryEntry | PartEntry
 
 
 @dataclass(frozen=True)

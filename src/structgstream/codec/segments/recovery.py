@@ -24,7 +24,6 @@ from structgstream.codec.container.records import (
 from structgstream.codec.packets import StreamHeader, pack_header, unpack_header
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MAX_MANIFEST_BYTES,
     Edge,
     Manifest,
     PartEntry,
@@ -32,13 +31,12 @@ from structgstream.codec.segments.manifest import (
     SegmentEntry,
     Window,
     init_name,
-    manifest_from_json,
     part_name,
     segment_name,
     sha256_of,
 )
 from structgstream.codec.segments.store import Store
-from structgstream.codec.segments.stored_bytes import paged, verified
+from structgstream.codec.segments.stored_bytes import paged, read_manifest, verified
 from structgstream.errors import StreamError
 
 
@@ -238,8 +236,7 @@ def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
 
 def _named(store: Store, there: frozenset[str]) -> Draft | None:
     """What the manifest names; a damaged last part is as one that was never written."""
-    data = store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
-    manifest = manifest_from_json(data, name=f"{MANIFEST} in {store.name}")
+    manifest = read_manifest(store)
     segments = [entry for entry in manifest.segments if entry.segment >= manifest.window.first_segment]
     for entry in (*manifest.periods, *manifest.history, *segments):
         if entry.file not in there:

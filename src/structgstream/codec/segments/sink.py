@@ -19,19 +19,17 @@ from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, sound_record
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MAX_MANIFEST_BYTES,
     Edge,
     Manifest,
-    PeriodEntry,
     SegmentEntry,
     Window,
-    manifest_from_json,
     manifest_to_json,
 )
 from structgstream.codec.segments.recovery import (
     Draft,
     empty_manifest,
     init_file,
+    next_segment,
     part_of,
     period_entry,
     periods_in,
@@ -44,7 +42,7 @@ from structgstream.codec.segments.recovery import (
     without_empty_period,
 )
 from structgstream.codec.segments.store import Store
-from structgstream.codec.segments.stored_bytes import segments_from
+from structgstream.codec.segments.stored_bytes import read_manifest, segments_from
 from structgstream.errors import StorageError, StreamError
 
 
@@ -56,74 +54,63 @@ class SegmentsOptions:
     grace_seconds: float = 120.0  # seconds that a file stays after the last manifest that named it
 
 
-@dataclass(frozen=True)
-class Turnover:
-    """What a manifest changes of a window; nothing without one."""
-
-    stay: tuple[SegmentEntry, ...]  # segments in the window
-    leave: tuple[SegmentEntry, ...]  # those that were in it before
-    window: Window  # of the manifest
-
-
 class Retention:
-    """Follows which files manifests name, and removes those that none has named for the time of grace."""
+    """Moves the window, and removes files that no manifest has named for the time of grace."""
 
     def __init__(self, store: Store, options: SegmentsOptions, elapsed: Callable[[], float]) -> None:
         self._store, self._options, self._elapsed = store, options, elapsed
-        self._present: tuple[SegmentEntry, ...] = ()  # segments in the window, if there is one
-        self._needed: tuple[SegmentEntry, ...] = ()  # those that have left it and are needed to resume
-        self._periods: tuple[PeriodEntry, ...] = ()  # of the last manifest
-        self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
+        self._last: Manifest | None = None
+        # With a window the segments in it, and that which resuming needs; without one those that the manifest lists.
+        self._kept: list[SegmentEntry] = []
+        self._leaving: dict[str, float] = {}  # files that no manifest names, and since when
 
     def take_up(self, manifest: Manifest) -> None:
         """Begins with a stream that is there, whose last manifest this is. Raises StreamError if a page of its history
         is missing or damaged."""
-        there = self._store.names()
-        self._periods = manifest.periods
+        stale = stale_files(manifest, self._store.names())
+        listed: Iterable[SegmentEntry] = manifest.segments
         if self._options.window_seconds is not None:
-            first, needed = manifest.window.first_segment, running_period(manifest).first_segment
-            listed = [*segments_from(self._store, manifest.history, manifest.segments, first=min(first, needed))]
-            self._present = tuple(entry for entry in listed if entry.segment >= first)
-            self._needed = tuple(entry for entry in listed if entry.segment == needed < first)
-        self._leaving = dict.fromkeys(sorted(stale_files(manifest, there)), self._elapsed())
+            first = min(manifest.window.first_segment, running_period(manifest).first_segment)
+            listed = segments_from(self._store, manifest.history, manifest.segments, first=first)
+        self._last, self._kept = manifest, [entry for entry in listed if entry.file not in stale]
+        self._leaving = dict.fromkeys(sorted(stale), self._elapsed())
 
-    def turnover(self, manifest: Manifest) -> Turnover:
-        """What the window becomes with a manifest that is to be published."""
+    def window(self, manifest: Manifest) -> Window:
+        """The window of a manifest that is to be published."""
         window = replace(manifest.window, seconds=self._options.window_seconds)
         if window.seconds is None:
-            return Turnover((), (), window)
-        first = manifest.segments[0].segment if manifest.segments else 0
-        listed = [entry for entry in manifest.segments if entry.segment >= manifest.window.first_segment]
-        present = (*(entry for entry in self._present if entry.segment < first), *listed)
+            return window
         start = manifest.edge.pts_seconds - window.seconds
-        gone = next((i for i, entry in enumerate(present) if entry.pts_seconds[1] >= start), len(present))
-        if gone:
-            last = present[gone - 1]
-            window = Window(last.first_frame + last.frames, last.segment + 1, window.seconds)
-        return Turnover(present[gone:], present[:gone], window)
+        present = [entry for entry in self._segments(manifest) if entry.segment >= window.first_segment]
+        if not (left := [entry for entry in present if entry.pts_seconds[1] < start]):
+            return window
+        return Window(left[-1].first_frame + left[-1].frames, left[-1].segment + 1, window.seconds)
 
-    def published(self, manifest: Manifest, turnover: Turnover, leaving: Iterable[str]) -> None:
-        """Takes in that a manifest is there, the first not to name the files ``leaving``, and removes what has not been
-        named for long enough."""
-        needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
-        left = (*self._needed, *turnover.leave)
-        ended = {period.file for period in self._periods} - {period.file for period in manifest.periods}
-        self._present, self._periods = turnover.stay, manifest.periods
-        self._needed = tuple(entry for entry in left if entry.segment == needed)
-        self._forget([*leaving, *sorted(ended), *(entry.file for entry in left if entry.segment != needed)])
-
-    def written(self, name: str) -> None:
-        """Takes in that a file was written: what a killed run had written too early may come again, and then stays."""
-        self._leaving.pop(name, None)
-
-    def _forget(self, leaving: Iterable[str]) -> None:
+    def published(self, manifest: Manifest) -> None:
+        """Takes in that a manifest is there, and removes what has not been named for long enough."""
+        segments = self._segments(manifest)
+        others = () if self._last is None else (*self._last.periods, *self._last.parts)
+        stale = stale_files(manifest, frozenset(entry.file for entry in (*self._kept, *segments, *others)))
+        windowed = self._options.window_seconds is not None
+        self._kept = [entry for entry in segments if entry.file not in stale] if windowed else [*manifest.segments]
+        self._last = manifest
         now = self._elapsed()
-        self._leaving |= dict.fromkeys(leaving, now)
+        self._leaving |= dict.fromkeys(sorted(stale), now)
         late = now - self._options.grace_seconds
         for name in [name for name, since in self._leaving.items() if since <= late]:
             del self._leaving[name]
             with suppress(StorageError):  # It is found again when the stream is resumed.
                 self._store.delete(name)
+
+    def written(self, name: str) -> None:
+        """Takes in that a file was written: what a killed run had written too early may come again, and then stays."""
+        self._leaving.pop(name, None)
+
+    def _segments(self, manifest: Manifest) -> list[SegmentEntry]:
+        """Those that were kept with the last manifest, except one that was opened again, and those that this adds."""
+        first, end = 0 if self._last is None else next_segment(self._last), next_segment(manifest)
+        kept = [entry for entry in self._kept if entry.segment < end]
+        return [*kept, *(entry for entry in manifest.segments if entry.segment >= first)]
 
 
 _RECENT_FRAMES = 8
@@ -194,7 +181,7 @@ class SegmentsSink:
         size = draft.manifest.periods[-1].bytes
         self._header_bytes = max(self._header_bytes, size)
         self._check_room(draft, self._largest)
-        self._publish(draft, [])
+        self._publish(draft)
         return size
 
     def write(self, packet: Packet) -> int:
@@ -209,17 +196,14 @@ class SegmentsSink:
         self._check_room(draft, len(record))
         part = part_of(record)
         self._put([(part.file, record)])
-        leaving: list[str] = []
         if packet.kind is PacketKind.KEY:
-            leaving = [one.file for one in draft.manifest.parts]
             draft = with_segment(draft)
         elif not draft.records:
-            leaving = [draft.manifest.segments[-1].file]
             draft = reopened(draft, self._store)
         captured = self._clocks.captured(packet.index)
         edge = Edge(packet.index, packet.pts_seconds, captured, self._clocks.wall())
         self._published.append(edge.published_unix_seconds)
-        self._publish(with_frame(draft, part, record, edge), leaving)
+        self._publish(with_frame(draft, part, record, edge))
         return len(record)
 
     def close(self) -> None:
@@ -232,10 +216,9 @@ class SegmentsSink:
         try:
             if draft is None or draft.manifest.edge.frame < 0:
                 return
-            leaving = [part.file for part in draft.manifest.parts]
             draft = with_segment(draft)
             manifest = without_empty_period(draft.manifest)
-            self._publish(replace(draft, manifest=replace(manifest, live=False)), leaving)
+            self._publish(replace(draft, manifest=replace(manifest, live=False)))
         finally:
             self._draft = None
 
@@ -249,28 +232,24 @@ class SegmentsSink:
         self._largest = max(map(len, found.records), default=0)
         self._put(found.files)
         self._retention.take_up(found.manifest)
-        self._publish(replace(found, manifest=replace(found.manifest, live=True)), [])
+        self._publish(replace(found, manifest=replace(found.manifest, live=True)))
 
     def _remove(self, there: frozenset[str]) -> int:
         """Remove the stream that is to be replaced, its manifest first; returns its last sequence number."""
         sequence = 0
-        if MANIFEST in there:
-            with suppress(StreamError):  # It is being replaced, whatever it says.
-                data = self._store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
-                sequence = manifest_from_json(data, name=MANIFEST).sequence
+        with suppress(StreamError):  # It is being replaced, whatever it says.
+            sequence = read_manifest(self._store).sequence
         for name in sorted(there, key=lambda name: (name != MANIFEST, not name.startswith("init-"), name)):
             self._store.delete(name)
         return sequence
 
-    def _publish(self, draft: Draft, leaving: Iterable[str]) -> None:
-        """Write the files of a draft, then its manifest, the first not to name the files ``leaving``; then remove what
-        has not been named for long enough."""
+    def _publish(self, draft: Draft) -> None:
+        """Write the files of a draft, then its manifest; then remove what has not been named for long enough."""
         self._put(draft.files)
-        turnover = self._retention.turnover(draft.manifest)
-        manifest = self._stamped(draft.manifest, turnover.window)
+        manifest = self._stamped(draft.manifest, self._retention.window(draft.manifest))
         self._put([(MANIFEST, manifest_to_json(manifest))])
         self._draft = Draft(manifest, draft.records)
-        self._retention.published(manifest, turnover, leaving)
+        self._retention.published(manifest)
 
     def _stamped(self, manifest: Manifest, window: Window) -> Manifest:
         """The manifest with its next number, its window, and the pace of late."""
