@@ -146,9 +146,10 @@ def test_a_cluster_without_a_token_is_not_joined(ray: FakeRay, monkeypatch: pyte
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     with pytest.raises(ConfigError, match="no token for the Ray cluster"):
         RayEngine("head:6379")
-    os.environ["RAY_AUTH_MODE"] = "disabled"
-    with pytest.raises(ConfigError, match="RAY_AUTH_MODE is 'disabled'"):
-        RayEngine("head:6379")
+    for mode in ("disabled", "off", ""):
+        os.environ["RAY_AUTH_MODE"] = mode
+        with pytest.raises(ConfigError, match=f"RAY_AUTH_MODE is '{mode}'"):
+            RayEngine("head:6379")
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(tmp_path)}
     joined = RayEngine("head:6379")
     assert ray.given["address"] == "head:6379"

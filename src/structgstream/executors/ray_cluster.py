@@ -104,14 +104,14 @@ class RayEngine:
 def _protect(*, begins_one: bool) -> None:
     """Enables token authentication and disables usage statistics; must be called before Ray is imported."""
     mode = os.environ.setdefault("RAY_AUTH_MODE", "token")
-    if mode == "disabled":
+    if mode != "token":  # Ray takes what it does not know as disabled.
         raise ConfigError(
-            "RAY_AUTH_MODE is 'disabled', so that anybody who reaches the cluster's ports could run code on its "
-            "machines; start the cluster with RAY_AUTH_MODE=token, and set the same here (docs/cluster.md)."
+            f"RAY_AUTH_MODE is {mode!r}, and without 'token' anybody who reaches the cluster's ports could run code on "
+            "its machines; start the cluster with RAY_AUTH_MODE=token, and set the same here (docs/cluster.md)."
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     given = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
-    if mode != "token" or given or (Path.home() / TOKEN_FILE).is_file():
+    if given or (Path.home() / TOKEN_FILE).is_file():
         return
     if not begins_one:
         raise ConfigError(

@@ -102,7 +102,7 @@ _MAX_SHARE = 512  # lanes cost at most a 512th of a section
 
 
 def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables) -> int:
-    """Number of lanes that the encoder takes: the most that cost less than a 512th of the symbols' bytes."""
+    """Number of lanes that the encoder takes: the most that cost at most a 512th of the symbols' bytes."""
     used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
     size_bytes = int(used @ code_costs()) >> COST_BITS + 3
     return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MAX_SHARE <= size_bytes)
