@@ -22,7 +22,11 @@ function builtPlayer(): string {
 }
 
 /** Pages are composited without software GL, which takes twice as long for them; WebGL still has it. */
-const FLAGS = ["--disable-gpu-compositing", "--disable-gpu-rasterization"];
+const FLAGS = [
+  "--disable-gpu-compositing",
+  "--disable-gpu-rasterization",
+  "--autoplay-policy=no-user-gesture-required", // otherwise sound may start only after a click, by chance
+];
 const VIEWPORT = { width: 320, height: 240 };
 
 interface Opened {
