@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import inspect
+from pathlib import Path
+
+import pytest
 
 from structgstream import errors
 
@@ -19,4 +22,14 @@ def test_exhausted_memory_is_a_memory_error_too() -> None:
 
 
 def test_a_missing_extra_names_the_command_that_brings_it() -> None:
-    assert "pip install 'structgstream[capture]'" in str(errors.MissingExtraError("cv2", "capture"))
+    with pytest.raises(errors.MissingExtraError, match=r"is not installed; .* pip install 'structgstream\[capture\]'"):
+        errors.import_extra("structgstream_missing.part", "capture")
+
+
+def test_an_extra_that_cannot_be_imported_is_not_called_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "structgstream_broken.py").write_text("raise ImportError('libX11.so.6: cannot open')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(errors.MissingExtraError, match=r"cannot be imported \(libX11\.so\.6: cannot open\)"):
+        errors.import_extra("structgstream_broken", "capture")

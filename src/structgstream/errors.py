@@ -68,18 +68,18 @@ class PlayerError(StructGStreamError):
 
 
 class MissingExtraError(StructGStreamError):
-    """An optional dependency is missing; the message names the extra that installs it."""
+    """An optional dependency is missing or ``broken``; the message names the extra that installs it."""
 
-    def __init__(self, module: str, extra: str) -> None:
-        super().__init__(
-            f"The module {module!r} is needed here and is not installed; "
-            f"install it with: pip install 'structgstream[{extra}]'"
-        )
+    def __init__(self, module: str, extra: str, *, broken: str | None = None) -> None:
+        state = "is not installed; install it" if broken is None else f"cannot be imported ({broken}); install it again"
+        super().__init__(f"The module {module!r} is needed here and {state} with: pip install 'structgstream[{extra}]'")
 
 
 def import_extra(module: str, extra: str) -> typing.Any:
-    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing."""
+    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing or
+    cannot be imported."""
     try:
         return importlib.import_module(module)
-    except ImportError:
-        raise MissingExtraError(module.partition(".")[0], extra) from None
+    except ImportError as error:
+        broken = None if isinstance(error, ModuleNotFoundError) else str(error)
+        raise MissingExtraError(module.partition(".")[0], extra, broken=broken) from error

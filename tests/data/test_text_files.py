@@ -27,10 +27,11 @@ def test_one_text_in_every_encoding(tmp_path: Path, encoding: str, end: str) -> 
     assert read_text(file) == TEXT
 
 
-def test_what_is_no_text(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("mark", "place"), [(b"", 1), (b"\xef\xbb\xbf", 4)])
+def test_what_is_no_text(tmp_path: Path, mark: bytes, place: int) -> None:
     file = tmp_path / "rig.txt"
-    file.write_bytes("Köln".encode("latin-1"))
-    with pytest.raises(Unreadable, match="no Unicode text from byte 1 on; save it as UTF-8"):
+    file.write_bytes(mark + "Köln".encode("latin-1"))
+    with pytest.raises(Unreadable, match=f"no Unicode text from byte {place} on; save it as UTF-8"):
         read_text(file)
 
 

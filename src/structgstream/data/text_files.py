@@ -47,7 +47,8 @@ def read_text(file: Path) -> str:
     try:
         text = data.decode(json.detect_encoding(data))
     except UnicodeDecodeError as error:
-        raise Unreadable(f"it is no Unicode text from byte {error.start} on; save it as UTF-8") from None
+        place = error.start + len(data) - len(error.object)  # which lacks the mark
+        raise Unreadable(f"it is no Unicode text from byte {place} on; save it as UTF-8") from None
     return unicodedata.normalize("NFC", text.replace("\r\n", "\n").replace("\r", "\n"))
 
 

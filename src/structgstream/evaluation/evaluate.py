@@ -240,7 +240,9 @@ class _Comparison:
         view, backend = self.views[camera], self.backend
         if min(truth.shape[:2]) > 1:
             scores = replace(scores, **half_scores(scene, view, truth, backend=backend, mask=mask))
-        if stored is not None and camera in stored.images:
+        if stored is not None:
+            if camera not in stored.images:
+                raise CaptureError(f"The stored picture of camera {camera!r} in frame {index} has gone; restore it.")
             large, large_mask = stored.images[camera], stored.masks.get(camera)
             scores = replace(scores, **stored_scores(scene, view, large, backend=backend, mask=large_mask))
         if ghosts is not None:
