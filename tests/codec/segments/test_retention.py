@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, segment_name
+from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, Window, segment_name
 from structgstream.codec.segments.recovery import empty_manifest
 from structgstream.codec.segments.sink import Retention, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
@@ -82,3 +82,20 @@ def test_what_a_stream_that_is_taken_up_needed_goes_when_another_period_runs(sto
         store.put(segment(segments - 1).file, b"")
         last = publish(retention, manifest(segments, periods=(FIRST, SECOND), after=last))
     assert there(store) == [4, 5]
+
+
+def test_what_went_before_a_stream_is_taken_up_is_not_removed_again(
+    store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last = manifest(8, after=replace(manifest(8), window=Window(15, 5, 4.0)))
+    for number in range(1, 5):  # resuming needs the first one
+        store.delete(segment(number).file)
+    deleted: list[str] = []
+    monkeypatch.setattr(store, "delete", deleted.append)
+    now = [0.0]
+    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=5.0), lambda: now[0])
+    retention.take_up(last)
+    for now[0] in (1.0, 7.0, 14.0):
+        last = publish(retention, last)
+    assert last.window.first_segment == 6
+    assert deleted == [segment(5).file]

@@ -72,7 +72,7 @@ class Retention:
         if self._options.window_seconds is not None:
             first = min(manifest.window.first_segment, running_period(manifest).first_segment)
             listed = segments_from(self._store, manifest.history, manifest.segments, first=first)
-        self._last, self._kept = manifest, [entry for entry in listed if entry.file not in stale]
+        self._last, self._kept = manifest, [entry for entry in listed if not _has_left(entry, manifest)]
         self._leaving = dict.fromkeys(sorted(stale), self._elapsed())
 
     def window(self, manifest: Manifest) -> Window:
@@ -88,14 +88,16 @@ class Retention:
 
     def published(self, manifest: Manifest) -> None:
         """Takes in that a manifest is there, and removes what has not been named for long enough."""
-        segments = self._segments(manifest)
+        segments, end = self._segments(manifest), next_segment(manifest)
         others = () if self._last is None else (*self._last.periods, *self._last.parts)
-        stale = stale_files(manifest, frozenset(entry.file for entry in (*self._kept, *segments, *others)))
-        windowed = self._options.window_seconds is not None
-        self._kept = [entry for entry in segments if entry.file not in stale] if windowed else [*manifest.segments]
-        self._last = manifest
+        named = {entry.file for entry in (*manifest.periods, *manifest.parts)}
+        leaving = [entry.file for entry in others if entry.file not in named]
+        leaving += [entry.file for entry in self._kept if entry.segment >= end]  # opened again
+        leaving += [entry.file for entry in segments if _has_left(entry, manifest)]
+        listed = manifest.segments if self._options.window_seconds is None else segments
+        self._last, self._kept = manifest, [entry for entry in listed if not _has_left(entry, manifest)]
         now = self._elapsed()
-        self._leaving |= dict.fromkeys(sorted(stale), now)
+        self._leaving |= dict.fromkeys(leaving, now)
         late = now - self._options.grace_seconds
         for name in [name for name, since in self._leaving.items() if since <= late]:
             del self._leaving[name]
@@ -111,6 +113,11 @@ class Retention:
         first, end = 0 if self._last is None else next_segment(self._last), next_segment(manifest)
         kept = [entry for entry in self._kept if entry.segment < end]
         return [*kept, *(entry for entry in manifest.segments if entry.segment >= first)]
+
+
+def _has_left(entry: SegmentEntry, manifest: Manifest) -> bool:
+    """Whether a segment has left the manifest's window, and resuming does not need it."""
+    return entry.segment < manifest.window.first_segment and entry.segment != running_period(manifest).first_segment
 
 
 _RECENT_FRAMES = 8
