@@ -28,12 +28,15 @@ class FakeRay:
         class RayError(Exception):
             pass
 
+        class RayTaskError(RayError):
+            pass
+
     def __init__(self) -> None:
         self.begun: list[dict[str, Any]] = []
         self.given: dict[str, Any] = {}
         self.cancelled: list[int] = []
         self.most = 0
-        self.fails: set[str] = set()
+        self.fails: dict[str, Exception] = {}
         self._in_flight: set[int] = set()
 
     def init(self, **given: Any) -> None:
@@ -66,7 +69,7 @@ class FakeRay:
         self._in_flight.discard(reference)
         task = self.begun[reference]["task"]
         if task.name in self.fails:
-            raise self.exceptions.RayError("the machine is gone")
+            raise self.fails[task.name]
         return run_task(task, {})
 
     def cancel(self, reference: int) -> None:
@@ -111,12 +114,18 @@ def test_few_tasks_are_in_flight_and_ray_does_not_repeat_them(ray: FakeRay) -> N
 
 
 def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
-    ray.fails = {"bad"}
+    ray.fails = {
+        "lost": ray.exceptions.RayError("the machine is gone"),
+        "bad": ray.exceptions.RayTaskError("no module"),
+    }
     with TaskQueue(RayEngine()) as executor:
-        executor.submit(Task("bad", ("true",), retries=2))
-        ending = all_endings(executor)["bad"]
-    assert (ending.killed, ending.attempts, len(ray.begun)) == (True, 3, 3)
-    assert ending.output == "the machine is gone"
+        for name in ray.fails:
+            executor.submit(Task(name, ("true",), retries=2))
+        lost, bad = map(all_endings(executor).get, ("lost", "bad"))
+    assert lost is not None
+    assert bad is not None
+    assert (lost.killed, lost.attempts, lost.output) == (True, 3, "the machine is gone")
+    assert (bad.killed, bad.done, bad.attempts, bad.output) == (False, False, 1, "no module")
 
 
 @pytest.mark.parametrize("cancelled", [KeyboardInterrupt, SystemExit, RuntimeError])

@@ -88,7 +88,8 @@ class RayEngine:
             return self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
             reason = str(getattr(error, "cause", None) or error)
-            return TaskResult(name, -1, time.monotonic() - begun, output=reason)
+            raised = isinstance(error, self._ray.exceptions.RayTaskError)  # by our code there; else it was killed
+            return TaskResult(name, 1 if raised else -1, time.monotonic() - begun, output=reason)
 
     def stop(self) -> None:
         """See ``Engine.stop``; a cluster that was joined continues without this process."""

@@ -65,7 +65,7 @@ def join_segments(
     firsts = [0, *accumulate(lengths)][:-1] if backend is None else [0]
     runs = [] if backend is None or workers == 1 else runs_of(lengths, workers=workers)
     if backend is not None and len(runs) > 1:
-        records = _blended_by_workers(ordered, runs, backend, workers, on_border or (lambda border: None))
+        records = _blended_by_workers(ordered, runs, output, backend, workers, on_border or (lambda border: None))
     else:
         blender = None if backend is None else GroupBlender(header_of(init), backend, on_border=on_border)
         records = _records(ordered, blender)
@@ -101,13 +101,14 @@ def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
 
 
 def _blended_by_workers(
-    paths: Sequence[Path], runs: Sequence[range], backend: Backend, workers: int, on_border: OnBorder
+    paths: Sequence[Path], runs: Sequence[range], output: Path, backend: Backend, workers: int, on_border: OnBorder
 ) -> Iterator[bytes]:
-    """The records of all groups in order; ``workers`` processes blend the runs."""
+    """The records of all groups in order; ``workers`` processes blend the runs, into files beside ``output``."""
     yield from _records(paths[:1], None)
     done = set[str]()
     slots = allocate_slots(workers=workers, cores=workers)
-    with TemporaryDirectory(prefix="structgstream-join-") as folder, TaskQueue(LocalEngine(slots)) as q:
+    beside = TemporaryDirectory(prefix=f".{output.name}.runs-", dir=output.parent)
+    with beside as folder, TaskQueue(LocalEngine(slots)) as q:
         outputs = [Path(folder, f"run-{number}") for number in range(len(runs))]
         for run, result in zip(runs, outputs):
             q.submit(run_task(paths[run.start - 1 : run.stop], result, device=backend.name))

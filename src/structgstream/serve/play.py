@@ -28,7 +28,7 @@ from structgstream.serve.pages import SERVED_POLICY, StreamFile, bundle, linked_
 from structgstream.serve.responses import NO_STORE_HEADERS, file_response
 
 JPEG_QUALITY = 95
-MAX_CACHED = 64  # pictures, of about a megabyte each at 1920 x 1080
+MAX_CACHED_PIXELS = 64 * 1920 * 1080  # of JPEG pictures, some 64 MB
 MAX_SKIPPED = 8  # decoding and skipping up to this many frames costs less than seeking in reopened videos
 
 
@@ -47,7 +47,8 @@ class Truth:
         self._cv2 = opencv()
         self._lock = threading.Lock()
         self._open: tuple[str, int, Iterator[MultiViewFrame]] | None = None
-        self._cached = lru_cache(MAX_CACHED)(self._encoded)
+        largest = max((source.rig[name].width * source.rig[name].height for name in cameras), default=1)
+        self._cached = lru_cache(max(1, MAX_CACHED_PIXELS // largest))(self._encoded)
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
         """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it. Raises
