@@ -216,16 +216,16 @@ class _Rounds:
     def run(self, current: Scene, *, again: bool) -> FitResult[Scene]:
         """One round from ``current``, whose anchors are those of frame 0; ``again`` if it is not the first."""
         fit, config, backend = self.fit, self.fit.config, self.fit.backend
-        with fit.watch.stage("find motion"):
+        with fit.watch.stage("select"):
             split = self._partition(current)
             inliers = [self.views[number] for number in split.selection.inliers]
         with fit.watch.stage("relocate lost anchors"):
             # In the first round, flow and iterations may still find these anchors.
             split, relocated = self._relocated(split, inliers) if again else (split, 0)
-        with fit.watch.stage("start motion"):
+        with fit.watch.stage("scene flow"):
             displaced, lifted = self._displaced(split, inliers)
             active_tiles = find_active_tiles(displaced, inliers, config=config.motion, backend=backend)
-        with fit.watch.stage("renew"):
+        with fit.watch.stage("spawn"):
             new = prune_and_spawn(
                 displaced,
                 inliers,

@@ -89,18 +89,18 @@ def fit_next_frame(
         result = optimizer.run(StartingPoint(scene, views, prior))
         return replace(result, counts={**result.counts, **light_counts})
 
-    with watch.stage("find motion"):
+    with watch.stage("select"):
         measured = measure(scene, views, pictures.changes, config=config.motion, backend=backend, floor=floor)
         selection = select_dynamic(scene, measured, config=config.motion, backend=backend, older=older)
         split = DynamicSplit.of(scene, selection)
         inliers = [views[number] for number in selection.inliers]
-    with watch.stage("start motion"):
+    with watch.stage("scene flow"):
         flow = apply_scene_flow(
             split, inliers, prior[selection.primitives], config=config.scene_flow, motion=config.motion, backend=backend
         )
     # Where flow was looked for, what is missing is too (``SceneFlowConfig.views``).
     swept = [view for view in inliers if view.index in selection.views_with_flow] or inliers
-    with watch.stage("renew"):
+    with watch.stage("spawn"):
         spawned = prune_and_spawn(
             flow.split,
             swept,
