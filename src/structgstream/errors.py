@@ -55,8 +55,9 @@ class OutOfMemoryError(StructGStreamError, MemoryError):
     """There is not enough memory; the message states for what."""
 
     def __init__(self, work: str, *, on_gpu: bool = False) -> None:
-        options = "--scale 0.5), or the processor (--device cpu" if on_gpu else "--scale 0.5"
-        super().__init__(f"Not enough memory {work}; close other programs, or use smaller pictures ({options}).")
+        advice = "close other programs, or use smaller pictures (--scale 0.5)"
+        advice += " or the processor (--device cpu)" if on_gpu else ""
+        super().__init__(f"Not enough memory {work}; {advice}.")
 
 
 class TaskError(StructGStreamError):
