@@ -203,7 +203,7 @@ def test_tables_of_the_compact_stream_are_of_its_preset(
     assert asked["full"] == with_iterations(PRESETS["rig"], 7)
     assert asked["quality-p2"].online.rounding.quality == 2.0
     assert asked["without-distance"].codec == "raw"
-    assert "w/o change gate" in capsys.readouterr().out
+    assert "Effects" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"distance.md", "effects.md", "rates.md"}
 
 
@@ -252,3 +252,13 @@ def test_a_wide_sheet_is_printed_in_parts_that_fit(capsys: pytest.CaptureFixture
     assert text.count("row 0") == text.count("row 1") == 3
     assert text.count("Scores [of]") == 3
     assert text.count("continued") == 2
+
+
+def test_only_the_rows_asked_for_are_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["--table", "free", "effects", "--rows", "compact", "uniform-spawn"]
+    assert configs_asked(arguments, tmp_path, monkeypatch).keys() == {"compact", "uniform-spawn"}
+
+
+def test_a_row_of_no_table_is_an_error_that_lists_the_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(["ablate", CLIP, "-o", str(tmp_path), "--rows", "full", "bare"], capsys, status=1)
+    assert "--rows bare: the tables have the rows without-scaling-factor, " in error

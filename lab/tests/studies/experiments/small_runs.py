@@ -24,5 +24,13 @@ def compact(*, seed: int = 0) -> StreamConfig:
     few = quick(seed=seed)
     patching = replace(COMPACT.online.patching, iteration=few.online.patching.iteration)
     online = replace(COMPACT.online, iterations=few.online.iterations, patching=patching)
-    first = {"points": few.points, "initial": few.initial, "denoising": few.denoising}
-    return replace(COMPACT, seed=seed, online=online, **first)
+    whole = COMPACT.initial
+    initial = replace(
+        few.initial,
+        losses=whole.losses,
+        perturbation=whole.perturbation,
+        offsets_per_anchor=whole.offsets_per_anchor,
+        all_drawn=whole.all_drawn,
+        floaters=whole.floaters,
+    )
+    return replace(COMPACT, seed=seed, points=few.points, initial=initial, online=online)

@@ -21,6 +21,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.session.loop import Session
+from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
@@ -86,6 +87,11 @@ def test_variants_of_a_seed_begin_with_one_frame(runs: Runs) -> None:
     assert result_of(runs.held).frames[2]["train_psnr"] != result_of(runs.full).frames[2]["train_psnr"]
 
 
+def compact_from_paper_mode() -> StreamConfig:
+    """The compact stream with paper mode's frame 0."""
+    return replace(compact(), initial=quick().initial, denoising=quick().denoising)
+
+
 def test_what_decides_frame_0_decides_its_name(runs: Runs) -> None:
     first = runs.first
     other = [
@@ -98,14 +104,14 @@ def test_what_decides_frame_0_decides_its_name(runs: Runs) -> None:
     same = [
         replace(first, capture=replace(CLIP, frames=7, scored=("cam00",))),
         replace(first, config=variants(quick())["random-spawn"].config),
-        replace(first, config=compact()),
+        replace(first, config=compact_from_paper_mode()),
     ]
     assert {one.name for one in same} == {first.name}
 
 
 def test_frame_0_is_kept_as_it_was_fitted(runs: Runs, tmp_path: Path) -> None:
     """A compact stream rounds it, by its own steps; what was rounded before would not say what those cost."""
-    first = FirstFrameRun(CLIP, compact(), tmp_path)
+    first = FirstFrameRun(CLIP, compact_from_paper_mode(), tmp_path)
     first.run(runs.backend)
     assert open_stream(first.stream).header.codec == "raw"
     assert packets(first.stream) == packets(runs.first.stream)

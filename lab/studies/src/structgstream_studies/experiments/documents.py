@@ -8,7 +8,7 @@ A marker is a comment of Markdown on a line of its own::
     <!-- end -->
 
 with ``ablation TABLE STUDY``, ``methods STUDY``, ``folds STUDY OTHER``, ``cited DATA``, ``readings STUDY``, ``effects
-STUDY``, ``parts STUDY``, ``rates STUDY``, ``bd-rate STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE
+STUDY``, ``rates STUDY``, ``bd-rate STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE
 STUDY``, ``plot STUDY`` and ``rate-plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a
 folder of results of one capture and one full method, named after the capture or the study.
 
@@ -42,7 +42,6 @@ from structgstream_studies.experiments.studies import (
     effect_titles,
     method_key,
     method_titles,
-    part_titles,
     variant_titles,
 )
 from structgstream_studies.experiments.variants import TABLES
@@ -181,10 +180,6 @@ def _effects(words: Sequence[str], studies: Studies) -> str:
     return markdown(effects_sheet(studies.get(words[0], ()), titles=effect_titles()))
 
 
-def _parts(words: Sequence[str], studies: Studies) -> str:
-    return markdown(effects_sheet(studies.get(words[0], ()), titles=part_titles(), title="Parts"))
-
-
 def _rates(words: Sequence[str], studies: Studies) -> str:
     """The points of the curve, and their comparison with other methods if there are results."""
     mine = studies.get(words[0], ())
@@ -242,7 +237,6 @@ _MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Studies], str]]] = {
     "cited": (1, _cited),
     "readings": (1, _readings),
     "effects": (1, _effects),
-    "parts": (1, _parts),
     "rates": (1, _rates),
     "bd-rate": (2, _bd_rate),
     "made-by": (1, _made_by),
@@ -257,7 +251,6 @@ _SHOWN: Mapping[str, Callable[[Sequence[str]], Container[str]]] = {
     "folds": lambda _: _method_titles(),
     "readings": lambda _: READINGS,
     "effects": lambda _: effect_titles(),
-    "parts": lambda _: part_titles(),
     "rates": lambda _: curve_titles(),
     "bd-rate": lambda _: curve_titles(),
 }

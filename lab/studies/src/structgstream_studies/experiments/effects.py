@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The effect of each part of the compact stream: the whole preset, and variants with one switch changed."""
+"""The effect of each part of the compact stream: the whole preset, and variants without one part."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from structgstream.errors import ConfigError
-from structgstream.scene.state import FieldName
-from structgstream.session.presets import StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream.training.frame0.regularizers import PerturbationConfig
 from structgstream.training.losses import LossWeights
-from structgstream.training.online.config import MotionConfig, OnlineConfig
-from structgstream.training.parameters import RoundingConfig
+from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import Summary, summaries
@@ -19,14 +17,10 @@ from structgstream_studies.experiments.variants import FULL, Variant
 EFFECTS_TABLE = "effects"
 WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
-BETTER_FIRST = "paper-better-first"
-"""Key of paper mode with the compact stream's frame 0."""
-DISTURBANCE_FIELDS = tuple(f"initial.perturbation.{name}" for name in ("dropped_share", "noise_scales"))
-LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
-OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
-CARRIED_SHARE, EASED, OTHER_RANK = 0.4, 0.5, 8
-"""Values of switches that are off in the whole preset."""
-PAPER_ITERATIONS = 100
+PAPER_ONLINE = "paper-online"
+"""Key of the paper's online frames on the compact stream's frame 0."""
+BARE = f"{WHOLE}-bare"
+"""Key of the row without any part about what moves, emerges or is occluded."""
 
 _COLUMNS = (
     ("psnr_changed", "psnr_changed"),
@@ -50,137 +44,177 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
         paper: paper mode, with the key :data:`~structgstream_studies.experiments.variants.FULL`.
 
     Raises:
-        ConfigError: ``full`` is no compact stream.
+        ConfigError: ``full`` is no compact stream, or lacks a part already.
     """
     require_compact(full)
-    rows = _Rows(full)
-    rows.add(Variant(FULL, "paper mode", paper))
-    rows.add(Variant(WHOLE, "compact, with everything", full))
-    rows.add(Variant(BETTER_FIRST, "paper mode on compact's frame 0", _with_first_of(paper, full)))
-    _of_frame_0(rows)
-    _of_the_gate(rows)
-    _of_coding(rows)
-    _of_iterations(rows)
-    _of_the_start(rows)
-    _of_free_gaussians(rows)
-    _of_the_light(rows)
-    return rows.found
+    rows = [
+        Variant(WHOLE, "`compact`", full),
+        Variant(FULL, "the paper's method (`rig`)", paper),
+        Variant(
+            PAPER_ONLINE,
+            "the paper's online frames on `compact`'s frame 0",
+            replace(paper, initial=full.initial, denoising=full.denoising),
+        ),
+        *_of_frame_0(full),
+        *_of_online_frames(full),
+    ]
+    for row in rows:
+        if row.changes and row.config == full:
+            raise ConfigError(
+                f"The table {EFFECTS_TABLE} leaves out {min(row.changes)}, which is off already; take a configuration "
+                "in which it is on."
+            )
+    return {row.key: row for row in rows}
 
 
-class _Rows:
-    """Collects the rows of the table.
+def _of_frame_0(full: StreamConfig) -> list[Variant]:
+    """Rows with a frame 0 of their own."""
+    initial, paper = full.initial, LossWeights()
 
-    Args:
-        full: what each of them changes.
-    """
+    def row(key: str, title: str, config: StreamConfig, *changes: str) -> Variant:
+        return Variant(f"{WHOLE}-{key}", title, config, frozenset(changes))
 
-    def __init__(self, full: StreamConfig) -> None:
-        self.full, self.whole = full, full.online
-        self.found: dict[str, Variant] = {}
-
-    def add(self, row: Variant) -> None:
-        self.found[row.key] = row
-
-    def row(self, key: str, title: str, config: StreamConfig, *changes: str) -> None:
-        """A change of any field."""
-        self.add(Variant(f"{WHOLE}-{key}", title, config, frozenset(changes)))
-
-    def online(self, key: str, title: str, config: OnlineConfig, *changes: str) -> None:
-        """A change of later frames."""
-        self.row(key, title, replace(self.full, online=config), *(f"online.{change}" for change in changes))
-
-    def dynamic(self, key: str, title: str, fields: frozenset[FieldName]) -> None:
-        """A change of the fields that frames change."""
-        self.online(key, title, replace(self.whole, dynamic=fields), "dynamic")
-
-    def priced(self, key: str, title: str, rounding: RoundingConfig, change: str) -> None:
-        """A change of quantization and its price."""
-        self.online(key, title, replace(self.whole, rounding=rounding), f"rounding.{change}")
-
-    def gated(self, key: str, title: str, motion: MotionConfig, change: str) -> None:
-        """A change of the gate."""
-        self.online(key, title, replace(self.whole, motion=motion), f"motion.{change}")
-
-
-def _of_frame_0(rows: _Rows) -> None:
-    full = rows.full
-    calm = replace(full, initial=replace(full.initial, perturbation=PerturbationConfig()))
-    rows.row("without-disturbance", "frame 0 w/o dropout and perturbation", calm, *DISTURBANCE_FIELDS)
-    paper = LossWeights()
-    losses = replace(full.initial.losses, l1=paper.l1, ssim=paper.ssim)
-    absolute = replace(full, initial=replace(full.initial, losses=losses))
-    rows.row("paper-losses", "frame 0 by the paper's weights of L1 and SSIM", absolute, *LOSS_FIELDS)
-    lively = replace(full, initial=replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False))
-    title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
-    rows.row("offsets", title, lively, *OFFSET_FIELDS)
-
-
-def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
-    """``config`` with the frame 0 of ``full``."""
-    return replace(config, initial=full.initial, denoising=full.denoising)
+    return [
+        row(
+            "without-perturbation",
+            "frame 0 without dropout and perturbation",
+            replace(full, initial=replace(initial, perturbation=PerturbationConfig())),
+            "initial.perturbation.dropped_share",
+            "initial.perturbation.noise_scales",
+        ),
+        row(
+            "paper-losses",
+            "frame 0 with the paper's weights of L1 and SSIM",
+            replace(full, initial=replace(initial, losses=replace(initial.losses, l1=paper.l1, ssim=paper.ssim))),
+            "initial.losses.l1",
+            "initial.losses.ssim",
+        ),
+        row(
+            "paper-offsets",
+            "5 Gaussians an anchor, of which about half are never drawn",
+            replace(
+                full,
+                initial=replace(initial, offsets_per_anchor=PRESETS["rig"].initial.offsets_per_anchor, all_drawn=False),
+            ),
+            "initial.offsets_per_anchor",
+            "initial.all_drawn",
+        ),
+        row(
+            "single-picture",
+            "frame 0 of one picture a camera",
+            replace(full, denoising=replace(full.denoising, frames=1)),
+            "denoising.frames",
+        ),
+        row(
+            "with-floaters",
+            "floaters of frame 0 kept",
+            replace(full, initial=replace(initial, floaters=replace(initial.floaters, enabled=False))),
+            "initial.floaters.enabled",
+        ),
+    ]
 
 
-def _of_the_gate(rows: _Rows) -> None:
-    motion = rows.whole.motion
-    rows.gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
-    eased = EASED if motion.hysteresis == 1.0 else 1.0
-    title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
-    rows.gated("memory", title, replace(motion, hysteresis=eased), "hysteresis")
-    carried = CARRIED_SHARE if motion.occluded_share == 0.0 else 0.0
-    title = "hidden anchors are carried along" if carried else "hidden anchors stay behind"
-    rows.gated("carrying", title, replace(motion, occluded_share=carried), "occluded_share")
+def _of_online_frames(full: StreamConfig) -> list[Variant]:
+    """Rows on the same frame 0."""
+    online = full.online
+    motion, rounding, flow = online.motion, online.rounding, online.scene_flow
 
+    def row(key: str, title: str, config: OnlineConfig, *changes: str) -> Variant:
+        paths = frozenset(f"online.{change}" for change in changes)
+        return Variant(f"{WHOLE}-{key}", title, replace(full, online=config), paths)
 
-def _of_coding(rows: _Rows) -> None:
-    whole = rows.whole
-    rows.priced("without-rate", "w/o rate penalty", replace(whole.rounding, rate_weight=0.0), "rate_weight")
-    rows.dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
-    rank = replace(whole, appearance_rank=OTHER_RANK)
-    rows.online(f"rank-{OTHER_RANK}", f"appearance in {OTHER_RANK} directions", rank, "appearance_rank")
-    rows.dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
-    prior = 0.0 if whole.motion_prior else 1.0
-    title = "with motion prior" if prior else "w/o motion prior"
-    rows.online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
-    incoherent = replace(whole, smoothness=replace(whole.smoothness, weight=0.0))
-    rows.online("without-coherence", "w/o price of incoherent motion", incoherent, "smoothness.weight")
-
-
-def _of_iterations(rows: _Rows) -> None:
-    whole = rows.whole
-    patching = replace(whole.patching, iteration=PAPER_ITERATIONS // 2)
-    paced = replace(whole, iterations=PAPER_ITERATIONS, patching=patching)
-    title = f"{PAPER_ITERATIONS} iterations in a frame"
-    rows.online("more-iterations", title, paced, "iterations", "patching.iteration")
-
-
-def _of_the_start(rows: _Rows) -> None:
-    whole, start = rows.whole, rows.whole.scene_flow
-    off, single = replace(start, enabled=False), replace(start, rounds=1)
-    rows.online("without-start", "w/o motion start", replace(whole, scene_flow=off), "scene_flow.enabled")
-    rows.online("one-round", "motion start in one round", replace(whole, scene_flow=single), "scene_flow.rounds")
-    motion = replace(whole.motion, residual_threshold=0.0)
-    rows.gated("without-residuals", "gate w/o residuals", motion, "residual_threshold")
-
-
-def _of_free_gaussians(rows: _Rows) -> None:
-    whole, patching = rows.whole, rows.whole.patching
-    spawn = "gradient" if patching.spawn == "off" else "off"
-    title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
-    rows.online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
-    births = replace(whole.spawn, enabled=False)
-    none = replace(whole, spawn=births, patching=replace(patching, spawn="off"))
-    rows.online("without-free", "w/o free 3DGs", none, "spawn.enabled", "patching.spawn")
-    large = replace(whole.spawn, thin=replace(whole.spawn.thin, enabled=False))
-    rows.online("without-thin-births", "w/o births of thin content", replace(whole, spawn=large), "spawn.thin.enabled")
-    rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
-
-
-def _of_the_light(rows: _Rows) -> None:
-    whole = rows.whole
-    dark = replace(
-        whole, exposure=replace(whole.exposure, enabled=False), dynamic=whole.dynamic.difference(["color_mlp"])
+    no_flow = replace(flow, enabled=False)
+    no_spawn = replace(online.spawn, enabled=False)
+    no_residuals = replace(motion, residual_threshold=0.0)
+    occluded_static = replace(motion, occluded_share=0.0)
+    no_smoothness = replace(online.smoothness, weight=0.0)
+    bare = replace(
+        online,
+        scene_flow=no_flow,
+        spawn=no_spawn,
+        motion=replace(motion, residual_threshold=0.0, occluded_share=0.0),
+        smoothness=no_smoothness,
+        motion_prior=0.0,
     )
-    rows.online("without-light", "global light not followed", dark, "exposure.enabled", "dynamic")
+    no_thin = replace(online.spawn, thin=replace(online.spawn.thin, enabled=False))
+    no_light = replace(
+        online,
+        exposure=replace(online.exposure, enabled=False),
+        dynamic=online.dynamic.difference(["color_mlp"]),
+    )
+    return [
+        row(
+            "all-dynamic",
+            "no selection: everything dynamic",
+            replace(online, motion=replace(motion, enabled=False)),
+            "motion.enabled",
+        ),
+        row(
+            "without-hysteresis",
+            "selection without hysteresis",
+            replace(online, motion=replace(motion, hysteresis=1.0)),
+            "motion.hysteresis",
+        ),
+        row(
+            "without-residuals",
+            "selection without residuals",
+            replace(online, motion=no_residuals),
+            "motion.residual_threshold",
+        ),
+        row(
+            "occluded-static",
+            "occluded anchors static",
+            replace(online, motion=occluded_static),
+            "motion.occluded_share",
+        ),
+        row(
+            "without-rate-term",
+            "no rate term",
+            replace(online, rounding=replace(rounding, rate_weight=0.0)),
+            "rounding.rate_weight",
+        ),
+        row(
+            "without-free-rate-term",
+            "no rate term of free Gaussians",
+            replace(online, rounding=replace(rounding, free_priced=False)),
+            "rounding.free_priced",
+        ),
+        row(
+            "without-appearance",
+            "no appearance",
+            replace(online, dynamic=online.dynamic.difference(["appearance"])),
+            "dynamic",
+        ),
+        row(
+            "without-base-scales",
+            "base scales static",
+            replace(online, dynamic=online.dynamic.difference(["base_scales"])),
+            "dynamic",
+        ),
+        row("without-smoothness", "no smoothness term", replace(online, smoothness=no_smoothness), "smoothness.weight"),
+        row("without-motion-prior", "no motion prior", replace(online, motion_prior=0.0), "motion_prior"),
+        row("without-scene-flow", "no scene flow", replace(online, scene_flow=no_flow), "scene_flow.enabled"),
+        row(
+            "one-round",
+            "scene flow in one round",
+            replace(online, scene_flow=replace(flow, rounds=1)),
+            "scene_flow.rounds",
+        ),
+        row("without-spawn", "no free Gaussians", replace(online, spawn=no_spawn), "spawn.enabled"),
+        row("without-thin-spawn", "no spawning of thin content", replace(online, spawn=no_thin), "spawn.thin.enabled"),
+        row("without-light", "global light not followed", no_light, "exposure.enabled", "dynamic"),
+        row(
+            "bare",
+            "no scene flow, spawning, residuals, occluded anchors, smoothness and prior",
+            bare,
+            "scene_flow.enabled",
+            "spawn.enabled",
+            "motion.residual_threshold",
+            "motion.occluded_share",
+            "smoothness.weight",
+            "motion_prior",
+        ),
+    ]
 
 
 def require_compact(config: StreamConfig) -> None:
@@ -195,24 +229,21 @@ def require_compact(config: StreamConfig) -> None:
         )
 
 
-def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str], title: str = "Effects") -> Sheet:
-    """Every row with its difference to the whole, seed by seed; rows without a result have dashes.
+def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str]) -> Sheet:
+    """Every row that has results, with its difference to the whole, seed by seed.
 
     Args:
         results: of one capture.
         titles: of the rows, in their order.
-        title: of the table.
     """
     found = summaries(result for result in results if result.key in titles)
     whole = found.get(WHOLE)
     heads = ["variant", "seeds", SCORES["psnr"].title, SCORES["psnr_camera_color"].title, "to compact, dB"]
     columns = [*heads, *(SCORES[name].title for _, name in _COLUMNS)]
-    return Sheet(title, columns, [[row, *_cells(found.get(key), whole)] for key, row in titles.items()])
+    return Sheet("Effects", columns, [[row, *_cells(found[key], whole)] for key, row in titles.items() if key in found])
 
 
-def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:
-    if summary is None:
-        return ["-"] * (4 + len(_COLUMNS))
+def _cells(summary: Summary, whole: Summary | None) -> list[str]:
     difference = None if whole is None or summary.key == WHOLE else summary.difference(whole, "psnr")
     cells = [
         str(len(summary.results)),

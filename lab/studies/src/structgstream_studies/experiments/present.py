@@ -12,7 +12,6 @@ from typing import Any
 from structgstream.errors import ConfigError
 from structgstream.session.presets import DEFAULT_PRESET, PRESETS, to_json
 from structgstream_studies.experiments.effects import effects
-from structgstream_studies.experiments.parts import parts
 from structgstream_studies.experiments.rate_distortion import qualities
 from structgstream_studies.experiments.readings import READINGS
 from structgstream_studies.experiments.results import Result, round_floats
@@ -64,7 +63,7 @@ def present_configs() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     for name, full in FULL_METHODS.items():
         configs: dict[str, Any] = {key: method.config for key, method in METHODS.items()} | dict(PRESETS)
         configs |= {key: reading.edit(full) for key, reading in READINGS.items()}
-        rows = (variants(full), effects(compact, paper=full), parts(compact), qualities(compact))
+        rows = (variants(full), effects(compact, paper=full), qualities(compact))
         configs |= {key: row.config for table in rows for key, row in table.items()}
         for key, config in configs.items():
             found.setdefault(key, {})[name] = _fields(round_floats(to_json(config)))

@@ -18,7 +18,6 @@ from structgstream_studies.experiments.figures import (
     write_curves,
     write_details,
 )
-from structgstream_studies.experiments.parts import PARTS_TABLE, parts
 from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.rate_distortion import (
     QUALITIES,
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
 
 READINGS_TABLE = "readings"
-COMPACT_TABLES = (EFFECTS_TABLE, PARTS_TABLE, RATES_TABLE)
+COMPACT_TABLES = (EFFECTS_TABLE, RATES_TABLE)
 """Tables of the compact stream."""
 COMPACT_PRESET = "compact"
 ADJACENT = 3
@@ -65,6 +64,7 @@ def ablation_runs(
     seeds: Sequence[int],
     folder: Path,
     paper: StreamConfig = PRESETS[PAPER_METHOD_PRESET],
+    rows: Sequence[str] = (),
 ) -> list[VariantRun]:
     """Every variant of the tables with every seed, seed by seed.
 
@@ -76,6 +76,7 @@ def ablation_runs(
         seeds: random seeds.
         folder: the output folder.
         paper: paper mode, a row of the table of effects.
+        rows: keys of the variants to run; all if empty.
 
     Raises:
         ConfigError: there is no such table, or it is one of the compact stream and ``full`` is none.
@@ -88,7 +89,7 @@ def ablation_runs(
     for seed in seeds:
         configs = _configs(tables, replace(full, seed=seed), replace(paper, seed=seed))
         keys = dict.fromkeys(key for name in tables for key in rows_of(name))
-        runs += [VariantRun(key, capture, configs[key], folder, frames) for key in keys]
+        runs += [VariantRun(key, capture, configs[key], folder, frames) for key in keys if not rows or key in rows]
     return runs
 
 
@@ -97,8 +98,6 @@ def _configs(tables: Sequence[str], full: StreamConfig, paper: StreamConfig) -> 
     found = variants(full)
     if EFFECTS_TABLE in tables:
         found |= effects(full, paper=paper)
-    if PARTS_TABLE in tables:
-        found |= parts(full)
     if RATES_TABLE in tables:
         found |= qualities(full)
     return configs | {key: variant.config for key, variant in found.items()}
@@ -108,8 +107,6 @@ def rows_of(table: str) -> list[str]:
     """Keys of the runs of a table."""
     if table == EFFECTS_TABLE:
         return list(effect_titles())
-    if table == PARTS_TABLE:
-        return list(part_titles())
     if table == RATES_TABLE:
         return [quality_key(quality) for quality in QUALITIES]
     return list(READINGS if table == READINGS_TABLE else TABLES[table].rows)
@@ -218,7 +215,7 @@ def write_ablation(folder: Path, table: str, runs: Sequence[VariantRun], *, back
 def _titles(table: str) -> dict[str, str]:
     if table == READINGS_TABLE:
         return {key: f"{one.question}: {one.answer}" for key, one in READINGS.items()}
-    of_compact = {EFFECTS_TABLE: effect_titles, PARTS_TABLE: part_titles, RATES_TABLE: curve_titles}
+    of_compact = {EFFECTS_TABLE: effect_titles, RATES_TABLE: curve_titles}
     return of_compact.get(table, variant_titles)()
 
 
@@ -227,8 +224,6 @@ def _ablation_sheet(table: str, results: Sequence[Result]) -> Sheet:
         return readings_sheet(results)
     if table == EFFECTS_TABLE:
         return effects_sheet(results, titles=effect_titles())
-    if table == PARTS_TABLE:
-        return effects_sheet(results, titles=part_titles(), title="Parts")
     return ablation_sheet(TABLES[table], results, titles=variant_titles())
 
 
@@ -255,11 +250,6 @@ def effect_titles() -> dict[str, str]:
     """The rows of the table of effects, in its order."""
     found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_METHOD_PRESET])
     return {key: variant.title for key, variant in found.items()}
-
-
-def part_titles() -> dict[str, str]:
-    """The rows of the table of parts, in its order."""
-    return {key: variant.title for key, variant in parts(PRESETS[COMPACT_PRESET]).items()}
 
 
 def _write_sheets(path: Path, sheets: Sequence[Sheet], remarks: Sequence[str] = ()) -> None:
