@@ -29,7 +29,7 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend
 from structgstream.kernels.values import FitFrame, Rasterizer, RasterOutput
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import render_picture
 from structgstream.scene.state import on_device
 from structgstream.session.presets import COMPACT
 from structgstream.training.result import FitResult
@@ -255,7 +255,7 @@ class Measurement:
 
             def draw(scene: Any = scene, cameras: Sequence[Any] = cameras) -> None:
                 for camera in cameras:
-                    to_8bit_image(render(scene, camera, self.backend).image)
+                    render_picture(scene, camera, self.backend)
 
             draw()
             found[title] = {"pictures a second": len(cameras) / self.seconds(draw)}

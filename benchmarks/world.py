@@ -20,7 +20,7 @@ from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import render_picture
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.online.config import OnlineConfig
@@ -122,7 +122,7 @@ def moved(scene: Scene, *, share: float, shift: tuple[float, float, float]) -> S
 
 def picture(scene: Scene, camera: Camera, backend: Backend) -> NDArray[np.uint8]:
     """What ``camera`` records, ``[H, W, 3]`` uint8."""
-    return to_8bit_image(render(scene, camera, backend).image)
+    return render_picture(scene, camera, backend)
 
 
 def wall_world(

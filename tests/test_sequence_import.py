@@ -17,7 +17,7 @@ from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians
-from structgstream.scene.harmonics import Y0
+from structgstream.harmonics import Y0
 from structgstream.sequence_import import ImportedSequence, import_sequence, ring_around
 from tests.support.backends import quickest_backend
 from tests.support.plain import some

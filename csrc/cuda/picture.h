@@ -56,6 +56,18 @@ struct sgs_cuda_reach {
 /* Waits for nothing. */
 int sgs_cuda_reached_tiles(const struct sgs_cuda_reach* views, int count, void* stream);
 
+/* What is displayed of a picture drawn on black (reference_raster.display): image [H,W,3], alpha [H,W], environment
+ * [terms,3] with 1, 4 or 9 terms, or null and 0. pixel_to_world [3,3]: a pixel (x, y, 1) times it is a ray. Out:
+ * picture [H,W,3]. */
+struct sgs_cuda_display_call {
+    const float *image, *alpha, *environment;
+    uint8_t* picture;
+    float pixel_to_world[9];
+    int32_t width, height, terms;
+};
+/* Waits for nothing. */
+int sgs_cuda_display(const struct sgs_cuda_display_call* call, void* stream);
+
 #ifdef __cplusplus
 }
 #endif

@@ -7,6 +7,7 @@
 #include <new>
 #include <vector>
 
+#include "display.h"
 #include "fit_memory.h"
 #include "fit_raster.h"
 #include "picture.h"
@@ -441,6 +442,11 @@ int sgs_cuda_reached_tiles(const sgs_cuda_reach* views, int count, void* stream)
     return each_element(reaches, stream);
 } catch (const std::bad_alloc&) {
     return structgstream::cuda::fit::kNoMemory;
+}
+
+int sgs_cuda_display(const sgs_cuda_display_call* call, void* stream) {
+    return structgstream::cuda::for_each(
+        structgstream::cuda::Display{*call}, int64_t{call->width} * call->height, stream);
 }
 
 }  // extern "C"

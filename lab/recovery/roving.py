@@ -37,7 +37,7 @@ from structgstream.kernels.backend import select_backend
 from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import render_picture
 from tests.support.calibration_errors import calibration_errors
 
 HELD_OUT = ("0", "10", "15", "30")  # of basketball
@@ -137,7 +137,7 @@ def _split_psnr(capture: Path, stream: Path, count: int) -> dict[str, float]:
             people = (
                 Undistortion(camera.filmed, camera.pinhole)(np.repeat(covered(filmed)[..., None], 3, -1))[..., 0] > 0
             )
-            drawn = to_8bit_image(render(scene, reader.header.camera(name), select_backend("cpu")).image)
+            drawn = render_picture(scene, reader.header.camera(name), select_backend("cpu"))
             errors = ((drawn.astype(float) - frame.images[name]) ** 2).mean(2)
             for kind, mask in (("psnr_people", people), ("psnr_still", ~people)):
                 found[kind].append(float(-10 * np.log10(errors[mask].mean() / 255**2)))

@@ -39,7 +39,7 @@ from structgstream.evaluation.pictures import png_bytes
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.kernels.backend import Backend, processor_backend
 from structgstream.memory import resident_bytes
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import render_picture
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
@@ -305,7 +305,7 @@ def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:
     camera = header.rig[name]
     width = min(PREVIEW_WIDTH, camera.width)
     view = header.camera(name).resized(width, max(round(camera.height * width / camera.width), 1))
-    return to_8bit_image(render(SceneDecoder(header).decode(packet), view, processor_backend()).image)
+    return render_picture(SceneDecoder(header).decode(packet), view, processor_backend())
 
 
 BEAT_SECONDS = 2.0

@@ -32,12 +32,12 @@ from structgstream.evaluation.camera_path import look_at
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.ply import MIN_OPACITY, read_header, read_ply
 from structgstream.exporters.write import pictures_psnr
+from structgstream.harmonics import Y0
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
-from structgstream.scene.harmonics import Y0
 from structgstream.scene.order import morton_order
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene

@@ -8,8 +8,8 @@ import torch
 from structgstream.cameras import Similarity
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.geometry import quaternion_matrices
+from structgstream.harmonics import Y0
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.harmonics import Y0
 from tests.support.plain import some
 from tests.support.rigs import arc_rig
 

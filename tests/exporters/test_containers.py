@@ -16,7 +16,7 @@ from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import Format, FrameOptions
 from structgstream.exporters.web import glb_bytes
 from structgstream.exporters.write import open_output
-from structgstream.scene.harmonics import Y0
+from structgstream.harmonics import Y0
 from tests.support.plain import RIG, picture, psnr, some
 
 pytest.importorskip("pxr", reason="the extra export is not installed")

@@ -15,7 +15,7 @@ from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.web import splat_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
-from structgstream.scene.harmonics import Y0
+from structgstream.harmonics import Y0
 from tests.support.plain import picture, psnr, some
 
 

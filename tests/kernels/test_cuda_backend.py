@@ -15,7 +15,7 @@ def test_own_operations_are_the_kernels() -> None:
     assert found.iterations is not None
     own = {name for name, function in found.functions.items() if function is not reference.functions[name]}
     assert own == {
-        *("rasterize", "generate_structured", "generate_views", "draw_views", "weigh_views"),
+        *("rasterize", "display", "generate_structured", "generate_views", "draw_views", "weigh_views"),
         *("draw_and_weigh_views", "reached_tiles", "l1_ssim", "sweep", "lift", "adam_step"),
         *(name for name in ("confident_flow", "plane_scores") if processor.name == "cpu"),
     }

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
-from structgstream.kernels import cuda_anchors, cuda_picture
+from structgstream.kernels import cuda_anchors, cuda_picture, reference_raster
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
@@ -129,3 +129,19 @@ def test_reached_tiles(emulation: Callable[[int], KernelLibrary]) -> None:
     (found,) = in_both_orders(emulation, lambda library: [cuda_picture.reached_tiles(library, *views, **options)])
     assert torch.equal(found, cpu.reached_tiles(*views, **options))
     assert 0 < found.sum() < found.numel()
+
+
+@pytest.mark.parametrize("terms", [0, 1, 4, 9])
+def test_displayed_pictures(emulation: Callable[[int], KernelLibrary], terms: int) -> None:
+    generator = torch.Generator().manual_seed(terms)
+    image = 1.4 * torch.rand(*SIZE, 3, generator=generator) - 0.2
+    alpha = torch.rand(*SIZE, generator=generator).where(torch.rand(*SIZE, generator=generator) < 0.7, 1.0)
+    coefficients = torch.randn(terms, 3, generator=generator) if terms else None
+    given = image, alpha, CAMERAS[1], coefficients
+    (found,) = in_both_orders(emulation, lambda library: [cuda_picture.display(library, *given)])
+    expected = reference_raster.display(*given)
+    assert found.dtype == torch.uint8
+    difference = (found.int() - expected.int()).abs()
+    assert difference.max() <= 1  # where another order of the sum falls on the other side of a half
+    assert (difference > 0).sum() <= 1e-3 * difference.numel()
+    assert (found.amin(), found.amax()) == (0, 255)

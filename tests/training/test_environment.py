@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import torch
 
+from structgstream.environment import environment, pixel_directions
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.color import CameraColor
-from structgstream.scene.environment import environment, pixel_directions
 from structgstream.scene.render import render
 from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
 from structgstream.training.frame0.seeding import EnvironmentConfig, fit_environment

@@ -33,7 +33,7 @@ from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.codec.sound import FrameSound
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import render_picture
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 
@@ -216,7 +216,7 @@ class StreamReader:
         if self._drawn is None or self._drawn[0] != index:
             self._drawn = None  # So that two scenes are not in memory at once.
             self._drawn = index, on_device(self.scene(index), chosen.device)
-        return to_8bit_image(render(self._drawn[1], view, chosen).image)
+        return render_picture(self._drawn[1], view, chosen)
 
     def _decoder_of(self, index: int) -> SceneDecoder:
         """The decoder of the period of a frame; a new one unless that is the period of the last decoded frame."""

@@ -54,7 +54,7 @@ from structgstream.evaluation.worst import worst_facts
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
-from structgstream.scene.render import Drawable, render, to_8bit_image
+from structgstream.scene.render import Drawable, render_picture
 from structgstream.session.frame_report import counts
 
 STORED_FRAMES, STORED_SHARE = 5, 4
@@ -96,7 +96,7 @@ def _psnr_and_ssim(
 ) -> dict[str, float | None]:
     if not truth.size or (mask is not None and not mask.any()):
         return {f"psnr_{size}": None, f"ssim_{size}": None}
-    picture = blackened(to_8bit_image(render(scene, camera, backend).image), mask)
+    picture = blackened(render_picture(scene, camera, backend), mask)
     return {f"psnr_{size}": psnr(picture, truth, mask), f"ssim_{size}": ssim(picture, truth, backend, mask)}
 
 
@@ -289,7 +289,7 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
 def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture, float]:
     """The 8-bit picture of ``camera`` (scene units), and the seconds until it was in main memory."""
     began = time.perf_counter()
-    picture = to_8bit_image(render(scene, camera, backend).image)
+    picture = render_picture(scene, camera, backend)
     return picture, time.perf_counter() - began
 
 

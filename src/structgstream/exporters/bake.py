@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plain Gaussians, as files of 3D Gaussian splatting have them, and how a scene is baked to them.
 
-A plain Gaussian has constant shape and opacity, and a direction-dependent colour (``scene/harmonics.py``, Note
+A plain Gaussian has constant shape and opacity, and a direction-dependent colour (``harmonics.py``, Note
 [Spherical harmonics]), with negative values set to 0.
 
 Note [Baking]
@@ -22,8 +22,8 @@ from torch import Tensor
 from structgstream.cameras import Camera, Similarity
 from structgstream.errors import StreamError
 from structgstream.gaussians import Gaussians
+from structgstream.harmonics import sh_basis
 from structgstream.kernels.backend import Backend
-from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 
@@ -39,7 +39,7 @@ class BakedGaussians:
     quats: Tensor  # [N, 4] wxyz, unit length, w not negative
     scales: Tensor  # [N, 3] standard deviations, in the unit of means
     opacities: Tensor  # [N] in (0, 1)
-    sh: Tensor  # [N, (degree + 1)^2, 3] sRGB coefficients (scene/harmonics.py)
+    sh: Tensor  # [N, (degree + 1)^2, 3] sRGB coefficients (harmonics.py)
 
     def __len__(self) -> int:
         return self.means.shape[0]

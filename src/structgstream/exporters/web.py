@@ -41,7 +41,7 @@ from torch import Tensor
 from structgstream.errors import ConfigError, import_extra
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions
-from structgstream.scene.harmonics import Y0
+from structgstream.harmonics import Y0
 from structgstream.scene.order import morton_order
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -31,8 +31,8 @@ from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.exporters.formats import FORMATS, SUFFIXES, Format, FrameOptions, is_one_file
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.web import glb_bytes, sog_bytes, splat_bytes, spz_bytes
+from structgstream.harmonics import Y0
 from structgstream.kernels.backend import Backend
-from structgstream.scene.harmonics import Y0
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device

@@ -20,8 +20,8 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
+from structgstream.kernels.reference_raster import as_picture
 from structgstream.kernels.values import TileSelection
-from structgstream.scene.render import as_picture
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (

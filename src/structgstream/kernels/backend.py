@@ -66,8 +66,8 @@ class Operation(Generic[Parameters, Result]):
 class Backend:
     """The operations that rendering and training need, and how one back-end computes them.
 
-    The cpu back-end has a C++ function for each. The cuda back-end runs the reference's function unless a comment
-    states otherwise.
+    Unless a comment states otherwise, the cpu back-end has a C++ function for each, and the cuda back-end runs the
+    reference's.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
@@ -82,7 +82,8 @@ class Backend:
     functions: Mapping[str, Callable[..., Any]]
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
-    rasterize = Operation(reference_raster.rasterize)  # cuda: own kernels; as the seven below
+    rasterize = Operation(reference_raster.rasterize)  # cuda: own kernels; as the eight below
+    display = Operation(reference_raster.display)  # cpu: the reference's function
     generate_views = Operation(ORACLE.generate_views)
     draw_views = Operation(ORACLE.draw_views)
     weigh_views = Operation(ORACLE.weigh_views)
@@ -143,7 +144,8 @@ def cpu_backend() -> Backend:
         cpu_raster.blending_weights,
         cpu_raster.picture_and_weights,
     )
-    return Backend("cpu", torch.device("cpu"), {**functions, **functions_of(views)}, iterations=cpu_fit.iterations)
+    functions |= functions_of(views) | {"display": reference_raster.display}
+    return Backend("cpu", torch.device("cpu"), functions, iterations=cpu_fit.iterations)
 
 
 def processor_backend() -> Backend:

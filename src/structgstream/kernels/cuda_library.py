@@ -32,6 +32,7 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_lift": ("i", "pp"),
     "sgs_cuda_views": ("i", "pip"),
     "sgs_cuda_reached_tiles": ("i", "pip"),
+    "sgs_cuda_display": ("i", "pp"),
     "sgs_cuda_raster_new": ("i", "ppp"),
     "sgs_cuda_raster_backward": ("i", "ppppp"),
     "sgs_cuda_raster_free": ("v", "p"),

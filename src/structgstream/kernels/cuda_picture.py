@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from structgstream.cameras import Viewport
+from structgstream.cameras import Camera, Viewport
+from structgstream.environment import pixel_to_world
 from structgstream.errors import BackendError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.cpu_raster import shape_arguments
@@ -50,6 +51,14 @@ class _Reach(ctypes.Structure):
         *members(ctypes.c_void_p, "viewmat K reduced_K visible tiles"),
         *members(ctypes.c_int32, "width height reduced_width reduced_height"),
         *members(ctypes.c_float, "near_plane margin"),
+    )
+
+
+class _Display(ctypes.Structure):
+    _fields_ = (
+        *members(ctypes.c_void_p, "image alpha environment picture"),
+        ("pixel_to_world", ctypes.c_float * 9),
+        *members(ctypes.c_int32, "width height terms"),
     )
 
 
@@ -188,6 +197,18 @@ def reached_tiles(
     ]
     call.run("sgs_cuda_reached_tiles", views, device)
     return found
+
+
+def display(library: KernelLibrary, image: Tensor, alpha: Tensor, camera: Camera, environment: Tensor | None) -> Tensor:
+    """See ``reference_raster.display``; without waiting for the GPU."""
+    picture = torch.empty(image.shape, dtype=torch.uint8, device=image.device)
+    given = (image.contiguous(), alpha.contiguous(), constant(environment), picture)
+    library.check_devices(*given)
+    rays = pixel_to_world(camera).flatten().tolist() if environment is not None else [0.0] * 9
+    terms = 0 if environment is None else len(environment)
+    call = _Display(*library.addresses(*given), (ctypes.c_float * 9)(*rays), camera.width, camera.height, terms)
+    library.call("sgs_cuda_display", ctypes.addressof(call), device=image.device)
+    return picture
 
 
 class _Raster:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Viewport
+from structgstream.cameras import Camera, Viewport
+from structgstream.environment import in_environment
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.values import TILE_PIXELS, Rasterizer, RasterOutput, TileSelection
@@ -253,6 +254,25 @@ def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: 
             (sums,) = torch.autograd.grad(output.image, colors, cotangent, retain_graph=more)
             found.append(sums[:, : group.shape[-1]])
     return torch.cat(found, dim=1)
+
+
+def as_picture(image: Tensor) -> Tensor:
+    """A rendering ``[..., H, W, 3]`` in sRGB as the displayed 8-bit picture: clamped, then rounded."""
+    # In place: a new tensor for each step takes six times as long.
+    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+
+
+def display(image: Tensor, alpha: Tensor, camera: Camera, environment: Tensor | None) -> Tensor:
+    """The displayed picture ``[H, W, 3]``, uint8.
+
+    Args:
+        image: ``[H, W, 3]`` drawn on black.
+        alpha: ``[H, W]`` coverage.
+        camera: whose picture it is.
+        environment: ``[(degree + 1)^2, 3]`` coefficients of the background, of degree 2 at most (``environment.py``);
+            None for black.
+    """
+    return as_picture(image if environment is None else in_environment(image, alpha, camera, environment))
 
 
 def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import Camera
+from structgstream.environment import in_environment
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, on_processor
+from structgstream.kernels.reference_raster import as_picture
 from structgstream.scene.active_tiles import ActiveTiles
-from structgstream.scene.environment import in_environment
 from structgstream.scene.scene import Scene
 
 
@@ -92,19 +93,29 @@ def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
     The colour correction is the mean one, the identity. The background is the scene's environment, if it has one.
     """
     with torch.no_grad():
-        if not isinstance(scene, Scene):
-            return draw(scene.gaussians(camera, backend), camera, backend)
-        (gaussians,) = scene.gaussians_of_views([camera], backend)  # a GPU generates them without being waited for
-        rendering = draw(gaussians, camera, backend)
-        if scene.environment is None:
+        rendering, environment = _on_black(scene, camera, backend), _environment(scene)
+        if environment is None:
             return rendering
-        return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, scene.environment))
+        return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, environment))
 
 
-def as_picture(image: Tensor) -> Tensor:
-    """A rendering ``[..., H, W, 3]`` in sRGB as the displayed 8-bit picture: clamped, then rounded."""
-    # In place: a new tensor for each step takes six times as long.
-    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+def render_picture(scene: Drawable, camera: Camera, backend: Backend) -> NDArray[np.uint8]:
+    """:func:`render` as the displayed picture ``[H, W, 3]``."""
+    with torch.no_grad():
+        rendering = _on_black(scene, camera, backend)
+        picture = backend.display(rendering.image, rendering.alpha, camera, _environment(scene))
+    return on_processor(picture)[0].numpy()
+
+
+def _on_black(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
+    if not isinstance(scene, Scene):
+        return draw(scene.gaussians(camera, backend), camera, backend)
+    (gaussians,) = scene.gaussians_of_views([camera], backend)  # a GPU generates them without being waited for
+    return draw(gaussians, camera, backend)
+
+
+def _environment(scene: Drawable) -> Tensor | None:
+    return scene.environment if isinstance(scene, Scene) else None
 
 
 def to_8bit_image(image: Tensor) -> NDArray[np.uint8]:

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera
+from structgstream.environment import environment
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
-from structgstream.scene.environment import environment
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.sampling import RigSampling
 
@@ -30,7 +30,7 @@ class Scene:
         distance_input: whether the distance to the camera is an input of the MLPs (paper: yes; Scaffold-GS: no).
         appearance_basis: ``[R, D]`` directions along which the anchors' features change after frame 0; None without
             ``appearance``.
-        environment: ``[(degree + 1)^2, 3]`` background coefficients (``scene/environment.py``); None for black.
+        environment: ``[(degree + 1)^2, 3]`` background coefficients (``environment.py``); None for black.
         sampling: sampling by the training cameras, which sets the low-pass of Gaussians (``scene/sampling.py``); None:
             the low-pass is that of the drawn picture.
         anchor_intervals: ``[M]`` sampling intervals that stay constant during iterations, because anchors move by far

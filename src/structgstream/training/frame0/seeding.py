@@ -25,14 +25,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from structgstream.environment import pixel_directions
 from structgstream.errors import CaptureError, MissingExtraError
+from structgstream.harmonics import sh_basis
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
-from structgstream.scene.environment import pixel_directions
 from structgstream.scene.free import FreeGaussians
-from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.frame0.densify import fresh_cells

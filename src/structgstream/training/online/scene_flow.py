@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend, on_processor
+from structgstream.kernels.reference_raster import as_picture
 from structgstream.kernels.values import Neighbors, ViewFlows, tile_pixels
 from structgstream.scene.active_tiles import ActiveTiles
-from structgstream.scene.render import as_picture
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest, weights_by_distance
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig

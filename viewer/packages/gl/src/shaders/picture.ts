@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What was blended, with what is behind it, as a picture (scene/environment.py, scene/harmonics.py). */
+/** What was blended, with what is behind it, as a picture (environment.py, harmonics.py). */
 
 import type { ProgramSource } from "../gpu/resources.js";
 import { COVERING_VERTEX } from "./mlp.js";

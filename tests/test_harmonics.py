@@ -5,7 +5,7 @@ import math
 
 import torch
 
-from structgstream.scene.harmonics import MAX_DEGREE, Y0, sh_basis
+from structgstream.harmonics import MAX_DEGREE, Y0, sh_basis
 from tests.support.spheres import fibonacci_sphere
 
 

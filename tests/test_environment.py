@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from structgstream.environment import environment, pixel_directions
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.environment import environment, pixel_directions
 from structgstream.scene.render import draw, render
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.spheres import fibonacci_sphere
