@@ -83,8 +83,8 @@ def compact_results() -> dict[str, list[Result]]:
 
 def test_parts_about_the_compact_stream() -> None:
     effects, rates, plot, differences = marked_parts(refresh_text(COMPACT, compact_results()))
-    assert "| `compact` | 1 | 31.00 | - | - | - | - | - | 20.0 |" in effects
-    assert "| the paper's method (`rig`) | 1 | 31.00 | - | +0.00 | - | - | - | 1000.0 |" in effects
+    assert "| compact | 1 | 31.00 | - | - | - | - | - | 20.0 |" in effects
+    assert "| the paper's method (rig) | 1 | 31.00 | - | +0.00 | - | - | - | 1000.0 |" in effects
     assert "| compact, quality +1 | 1 | 32.00 | - | - | 40.0 | 9.60 | - |" in rates
     assert "| paper mode, PSNR | 1 | 1000.0 | 31.00 | 20.0 | -98.0 | - | - |" in rates
     assert "\n- paper mode, PSNR: Its 1000.0 KB a frame are not on the curve, which ends at 40.0 KB.\n" in rates

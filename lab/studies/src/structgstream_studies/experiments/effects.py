@@ -48,11 +48,11 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     """
     require_compact(full)
     rows = [
-        Variant(WHOLE, "`compact`", full),
-        Variant(FULL, "the paper's method (`rig`)", paper),
+        Variant(WHOLE, "compact", full),
+        Variant(FULL, "the paper's method (rig)", paper),
         Variant(
             PAPER_ONLINE,
-            "the paper's online frames on `compact`'s frame 0",
+            "the paper's online frames on compact's frame 0",
             replace(paper, initial=full.initial, denoising=full.denoising),
         ),
         *_of_frame_0(full),
