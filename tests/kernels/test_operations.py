@@ -36,7 +36,7 @@ def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
 @pytest.mark.parametrize("build", [*BUILDERS, cuda_backend])
 def test_signatures_are_those_of_the_table(build: Callable[[], Backend]) -> None:
     backend = build()
-    assert len(Backend.operations()) == 19
+    assert len(Backend.operations()) == 20
     for name, operation in Backend.operations().items():
         wanted = inspect.signature(operation.oracle)
         found = inspect.signature(getattr(backend, name))
