@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from peers.captures import moving_capture
+from structgstream.harmonics import Y0
 from structgstream.scene.render import render
 from structgstream.training.result import Step
 from structgstream.training.views import training_views
@@ -13,7 +14,7 @@ from structgstream_studies.peers.additions import AdditionsConfig, spawned_at
 from structgstream_studies.peers.gaussians import GaussiansConfig, fit_gaussians, initial_gaussians, point_colors
 from structgstream_studies.peers.hash_grid import GridConfig
 from structgstream_studies.peers.methods import TINY_METHODS
-from structgstream_studies.peers.plain import Y0, PlainGaussians
+from structgstream_studies.peers.plain import PlainGaussians
 from structgstream_studies.peers.threedgstream import apply_transformation, box_of, in_box
 from structgstream_studies.peers.warm_up import WarmUpConfig, identity_loss, warm_up
 from tests.support.backends import quickest_backend

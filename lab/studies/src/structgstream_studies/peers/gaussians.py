@@ -9,6 +9,7 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
+from structgstream.harmonics import Y0
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.state import fields_of, parameters_of
@@ -19,7 +20,7 @@ from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Sc
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
 from structgstream_studies.peers.densify import DensifyConfig, densify, reset_opacities
-from structgstream_studies.peers.plain import Y0, PlainGaussians
+from structgstream_studies.peers.plain import PlainGaussians
 
 CAMERA = parameters_of(fields_of("camera"))
 LOSSES = LossWeights(l1=0.8, ssim=0.2)

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaussians as 3D Gaussian splatting has them: each with parameters of its own, and a colour that depends on direction.
 
-Note [Spherical harmonics]
-~~~~~~~~~~~~~~~~~~~~~~~~~~
-A colour is ``0.5 + Y_0 c_0 + sum Y_i c_i``, from below cut off at 0, where ``Y`` are the real spherical harmonics with
-the Condon-Shortley phase, of the direction from the camera to the Gaussian's mean, order by order (3DGS's convention).
+A colour is ``0.5 + Y_0 c_0 + sum Y_i c_i``, from below cut off at 0, with the ``Y`` of ``structgstream/harmonics.py``
+in the direction from the camera to the Gaussian's mean.
 """
 
 import math
@@ -15,23 +13,10 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians
+from structgstream.harmonics import Y0, sh_basis
 from structgstream.kernels.backend import Backend
 
-Y0 = 0.5 / math.sqrt(math.pi)
 MAX_DEGREE = 2
-
-
-def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics of unit ``directions`` ``[N, 3]`` above order 0: ``[N, (degree + 1)^2 - 1]``."""
-    x, y, z = directions.unbind(1)
-    found: list[Tensor] = []
-    if degree >= 1:
-        a = math.sqrt(3.0 / (4.0 * math.pi))
-        found += [-a * y, a * z, -a * x]
-    if degree >= 2:
-        a, b = math.sqrt(15.0 / (4.0 * math.pi)), math.sqrt(5.0 / (16.0 * math.pi))
-        found += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, 0.5 * a * (x * x - y * y)]
-    return torch.stack(found, dim=1) if found else directions.new_zeros(directions.shape[0], 0)
 
 
 def degree_of(coefficients: int) -> int:
@@ -48,7 +33,7 @@ class PlainGaussians:
         log_scales: ``[N, 3]`` logarithms of standard deviations.
         quats: ``[N, 4]`` wxyz, of any length.
         logit_opacities: ``[N]``.
-        base_colors: ``[N, 3]`` coefficients of order 0 (Note [Spherical harmonics]).
+        base_colors: ``[N, 3]`` coefficients of order 0.
         sh: ``[N, (degree + 1)^2 - 1, 3]`` the others.
     """
 
@@ -100,7 +85,7 @@ class PlainGaussians:
         colors = 0.5 + Y0 * self.base_colors
         used = self.degree if degree is None else min(degree, self.degree)
         if used:
-            basis = sh_basis(torch.nn.functional.normalize(self.means - center, dim=1), used)
+            basis = sh_basis(torch.nn.functional.normalize(self.means - center, dim=1), used)[:, 1:]
             colors = colors + (basis[:, :, None] * self.sh[:, : basis.shape[1]]).sum(1)
         return colors.clamp(min=0.0)
 
