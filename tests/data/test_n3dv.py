@@ -93,6 +93,18 @@ def test_points_of_a_model_with_a_frame_of_its_own(tmp_path: Path) -> None:
     np.testing.assert_allclose(open_n3dv(tmp_path).points, POINTS, atol=1e-6)  # type: ignore[arg-type]
 
 
+def test_three_neighbours_agree_by_the_extent_of_the_whole_rig(tmp_path: Path) -> None:
+    """A tenth of the distance between two neighbours is little in a large rig."""
+    rig = write_meet_room(tmp_path)
+    names = list(rig)[:3]
+    cameras = dict(rig.cameras)
+    viewmat = cameras[names[1]].viewmat.clone()
+    viewmat[:3, 3] += viewmat[:3, :3] @ (0.1 * (rig[names[2]].center - rig[names[0]].center))
+    cameras[names[1]] = replace(cameras[names[1]], viewmat=viewmat)
+    write_text_model(tmp_path / "sparse/0", rig.mapped(cameras), [(f"{n}.png", n) for n in names], points=POINTS)
+    assert open_n3dv(tmp_path).points is not None
+
+
 def test_points_of_another_rig_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     rig = write_n3dv(tmp_path)
     names = list(rig)

@@ -371,7 +371,8 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     )
     theirs = np.array([posed.center for posed in found.values()])
     ours = np.array([rig[name].center.numpy() for name in found])
-    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
+    extent = np.linalg.norm(np.ptp([camera.center.numpy() for camera in rig.cameras.values()], axis=0))
+    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / extent
     if not off <= MAX_OFF:
         log.warning(
             "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
