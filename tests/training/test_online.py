@@ -14,6 +14,7 @@ from structgstream.training.online.config import (
     OnlineConfig,
     OnlineRates,
     PatchingConfig,
+    SceneFlowConfig,
     SmoothnessConfig,
 )
 from structgstream.training.online.fit import fit_next_frame
@@ -220,6 +221,21 @@ def test_the_mean_of_the_last_iterations_can_be_the_result() -> None:
     assert torch.equal(mean.anchors.positions, again.anchors.positions)
     before, after = (psnr(rendered(scene, world, "cam00"), truth) for scene in (world.scene, mean))
     assert after > before + 2.0
+
+
+@pytest.mark.parametrize(("speed", "iterations"), [(0.16, 36), (0.06, 24)])
+def test_fast_motion_takes_more_iterations(speed: float, iterations: int) -> None:
+    """Fast is more than an eightieth of the width a frame."""
+    world = moving_world(2, cameras=6, movers=60, speed=speed, width=128, height=96)
+    config = replace(FOLLOWING, scene_flow=SceneFlowConfig(enabled=True), extra_iterations=0.5)
+    result = followed(world.scene, world, 1, config=config)
+    assert result.iterations == result.counts["iterations"] == iterations
+
+
+def test_the_effort_grows_with_the_share_that_moves_fast() -> None:
+    config = OnlineConfig(extra_iterations=0.5)
+    assert [config.effort(share) for share in (0.0, 0.02, 0.06, 0.1, 1.0)] == pytest.approx([1.0, 1.0, 1.25, 1.5, 1.5])
+    assert OnlineConfig().effort(1.0) == 1.0  # The paper's.
 
 
 def test_a_frame_like_the_last_one_costs_no_iteration_and_changes_no_bit() -> None:

@@ -17,8 +17,8 @@ class Scores:
     """Scores of one picture, or their mean over several, as ``docs/evaluation.md`` defines them.
 
     Those without pixels, without a fit of the camera's colour (``psnr_camera_color``), not requested or not available
-    are None; ``stream["not_available"]`` has the reason of the last. ``e_warp``, ``temporal_flip``, ``t_lpips``, ``flicker`` and
-    ``truth_flicker`` compare consecutive frames, so they are None in frame 0.
+    are None; ``stream["not_available"]`` has the reason of the last. ``e_warp``, ``temporal_flip``, ``t_lpips``,
+    ``flicker`` and ``truth_flicker`` compare consecutive frames, so they are None in frame 0.
     """
 
     psnr: float

@@ -327,6 +327,7 @@ COMPACT = replace(
     online=replace(
         MOTION.online,
         iterations=128,
+        extra_iterations=1.0,
         mean_of_last=0.25,
         rates=OnlineRates(final_share=0.4),
         patching=replace(MOTION.online.patching, spawn="off", iteration=46),

@@ -289,6 +289,9 @@ class OnlineConfig:
 
     iterations: int = 100
     """Optimisation steps per frame (paper: 100); fewer where the dynamic part is not in all views."""
+    extra_iterations: float = 0.0
+    """Further steps of a frame in which much moves fast, as a share of ``iterations``: all of them from ``MANY_FAST``
+    on, in proportion fewer down to ``FEW_FAST`` (not in the paper)."""
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
     appearance_rank: int = 4
@@ -314,9 +317,19 @@ class OnlineConfig:
     """Train and compare through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was
     trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
 
+    FEW_FAST: ClassVar[float] = 0.02
+    MANY_FAST: ClassVar[float] = 0.1
+    """Shares of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``). Up to the first it may be errors of
+    optical flow: where nothing moves fast it is 0.01 at most."""
+
     def __post_init__(self) -> None:
         if self.exposure.enabled and "color_mlp" not in self.dynamic:
             raise ConfigError("online.exposure changes F_c, which is not sent; add color_mlp to online.dynamic.")
+
+    def effort(self, fast_share: float) -> float:
+        """Factor on the iterations of a frame in which ``fast_share`` of the dynamic primitives moves fast."""
+        much = (fast_share - self.FEW_FAST) / (self.MANY_FAST - self.FEW_FAST)
+        return 1.0 + self.extra_iterations * min(max(much, 0.0), 1.0)
 
     @property
     def trained(self) -> frozenset[FieldName]:

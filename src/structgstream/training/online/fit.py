@@ -119,6 +119,7 @@ def fit_next_frame(
         split,
         flow.active_tiles,
         spawned.new_free,
+        fast_share=flow.counts["fast"] / max(len(flow.displacements), 1),
     )
     result = optimizer.run(start)
     return replace(
@@ -129,6 +130,7 @@ def fit_next_frame(
         counts={
             **result.counts,
             **flow.counts,
+            "iterations": result.iterations,
             **spawned.counts,
             "propagated": selection.occluded_count,
             **pictures.flow_counts,

@@ -48,7 +48,8 @@ NATIVE_LOSSES = frozenset({"l1", "ssim", "volume"})
 """Weights of a view's loss that they know."""
 NATIVE_SETTINGS = frozenset(
     {
-        *("iterations", "losses", "rates", "smoothness", "rounding", "mean_of_last", "sampling_filter"),
+        *("iterations", "extra_iterations", "losses", "rates", "smoothness", "rounding", "mean_of_last"),
+        "sampling_filter",
         *("dynamic", "appearance_rank", "patching", "motion", "scene_flow", "spawn", "motion_prior", "exposure"),
     }
 )
@@ -83,6 +84,7 @@ class StartingPoint:
         new_free: free Gaussians to add.
         reference: anchors as in ``scene``, from whose values the rate term and smoothness count; it has no free
             Gaussians, so these have no rate term. None: from ``scene``.
+        fast_share: share of the scene's primitives that move fast.
     """
 
     scene: Scene
@@ -92,6 +94,7 @@ class StartingPoint:
     active_tiles: Mapping[int, ActiveTiles] | None = None
     new_free: FreeGaussians = field(default_factory=FreeGaussians.empty)
     reference: Scene | None = None
+    fast_share: float = 0.0
 
     @property
     def known(self) -> Scene:

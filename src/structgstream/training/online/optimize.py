@@ -71,7 +71,7 @@ class FrameOptimizer:
             held = sampling.intervals(start.scene.anchors.positions + start.displacements[: len(start.scene.anchors)])
             start = replace(start, scene=replace(start.scene, anchor_intervals=held))
         # Each view is used as often as in a frame in which everything is trained.
-        iterations = math.ceil(config.iterations * len(seen) / len(start.views))
+        iterations = math.ceil(config.iterations * config.effort(start.fast_share) * len(seen) / len(start.views))
         rests = rest_every(config.motion.rest_every, views=len(seen), iterations=iterations)
 
         parameters, rate_term = self._parameters(start)
@@ -136,7 +136,8 @@ class FrameOptimizer:
         return splits and not tracks_screen and not unknown_natively(self.config, start.scene)
 
     def _patch_at(self, start: StartingPoint) -> int:
-        return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
+        in_all_views = self.config.patching.iteration * self.config.effort(start.fast_share)
+        return math.ceil(in_all_views * len(start.seen) / len(start.views))
 
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, RateTerm | None]:
         """The leaves of the scene, and the rate term of changes since it or since ``start.reference``."""
