@@ -202,6 +202,12 @@ def _of_online_frames(full: StreamConfig) -> list[Variant]:
         ),
         row("without-spawn", "no free Gaussians", replace(online, spawn=no_spawn), "spawn.enabled"),
         row("without-thin-spawn", "no spawning of thin content", replace(online, spawn=no_thin), "spawn.thin.enabled"),
+        row(
+            "without-extra-iterations",
+            "as many iterations however fast things move",
+            replace(online, extra_iterations=0.0),
+            "extra_iterations",
+        ),
         row("without-light", "global light not followed", no_light, "exposure.enabled", "dynamic"),
         row(
             "bare",
