@@ -317,8 +317,8 @@ class OnlineConfig:
     """Train and compare through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was
     trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
 
-    FEW_FAST: ClassVar[float] = 0.02
-    MANY_FAST: ClassVar[float] = 0.1
+    FEW_FAST: ClassVar[float] = 0.015
+    MANY_FAST: ClassVar[float] = 0.04
     """Shares of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``). Up to the first it may be errors of
     optical flow: where nothing moves fast it is 0.01 at most."""
 
