@@ -69,10 +69,14 @@ class SceneFlowConfig:
     enabled: bool = False
     """Displace primitives by optical flow (paper: False, everything starts at its last position)."""
     rounds: int = 2
-    """1: flow between pictures only; 2: also from the rendering to the pictures."""
+    """1: flow between pictures only; 2: also from the rendering to the pictures, in frames in which much moves fast."""
     views: int = 12
     """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
     every second or third, in turn."""
+
+    FEW_FAST: ClassVar[float] = 0.015
+    """Share of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``), above which much does. Up to it these
+    may be errors of optical flow: where nothing moves fast they are 0.01 at most."""
 
 
 @dataclass(frozen=True)
@@ -291,7 +295,7 @@ class OnlineConfig:
     """Optimisation steps per frame (paper: 100); fewer where the dynamic part is not in all views."""
     extra_iterations: float = 0.0
     """Further steps of a frame in which much moves fast, as a share of ``iterations``: all of them from ``MANY_FAST``
-    on, in proportion fewer down to ``FEW_FAST`` (not in the paper)."""
+    on, in proportion fewer down to ``SceneFlowConfig.FEW_FAST`` (not in the paper)."""
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
     appearance_rank: int = 4
@@ -317,10 +321,8 @@ class OnlineConfig:
     """Train and compare through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was
     trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
 
-    FEW_FAST: ClassVar[float] = 0.015
     MANY_FAST: ClassVar[float] = 0.04
-    """Shares of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``). Up to the first it may be errors of
-    optical flow: where nothing moves fast it is 0.01 at most."""
+    """Share of the dynamic primitives that move fast, from which on all ``extra_iterations`` are run."""
 
     def __post_init__(self) -> None:
         if self.exposure.enabled and "color_mlp" not in self.dynamic:
@@ -328,7 +330,8 @@ class OnlineConfig:
 
     def effort(self, fast_share: float) -> float:
         """Factor on the iterations of a frame in which ``fast_share`` of the dynamic primitives moves fast."""
-        much = (fast_share - self.FEW_FAST) / (self.MANY_FAST - self.FEW_FAST)
+        few = self.scene_flow.FEW_FAST
+        much = (fast_share - few) / (self.MANY_FAST - few)
         return 1.0 + self.extra_iterations * min(max(much, 0.0), 1.0)
 
     @property

@@ -119,7 +119,7 @@ def fit_next_frame(
         split,
         flow.active_tiles,
         spawned.new_free,
-        fast_share=flow.counts["fast"] / max(len(flow.displacements), 1),
+        fast_share=flow.fast_share,
     )
     result = optimizer.run(start)
     return replace(

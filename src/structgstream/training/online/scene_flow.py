@@ -3,8 +3,8 @@
 
 The gradient of a picture loss leads a Gaussian to its new position only while both overlap in the picture. Optical flow
 covers larger displacements, so that fast motion leaves no blur and no ghosts. There are two rounds: flow from the
-previous pictures to these, and then, after displacing the primitives (Note [Primitives]), flow from the rendering to
-these pictures, which also corrects errors of earlier frames.
+previous pictures to these, and then, after displacing the primitives (Note [Primitives]), where much moves fast, flow
+from the rendering to these pictures, which also corrects errors of earlier frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -136,6 +136,11 @@ class SceneFlow:
     active_tiles: Mapping[int, ActiveTiles]
     counts: Mapping[str, int]
 
+    @property
+    def fast_share(self) -> float:
+        """Share of the primitives that move fast."""
+        return self.counts["fast"] / max(len(self.displacements), 1)
+
 
 def apply_scene_flow(
     split: DynamicSplit,
@@ -155,7 +160,7 @@ def apply_scene_flow(
     rate term and smoothness count in any case. Spawning draws ``SceneFlow.split``, which is
     ``split.displaced(displacements)``, in ``active_tiles``: :func:`find_active_tiles` of a split that is at most a few
     pixels from that one, with its renderings (here: before the second round; without flow: at the last positions).
-    From here on only these tiles are drawn. Nothing but the log depends on the counts.
+    From here on only these tiles are drawn. Of the counts only ``fast`` matters beside the log: for ``fast_share``.
 
     Args:
         split: the scene of the previous frame in two parts, and ``split.selection``. If flow was estimated, that has
@@ -182,18 +187,19 @@ def apply_scene_flow(
     views_with_flow = [view for view in views if view.index in selection.views_with_flow]
     first = lift_flow(evidence, centers, priors, views_with_flow, backend=backend)
     fast = _is_fast(evidence, views_with_flow)
+    displaced, fast_count, fast_displaced = torch.stack([first.lifted, fast, fast & first.lifted]).sum(1).tolist()
 
     moved = split.displaced(first.displacements)
     active_tiles = find_active_tiles(moved, views, config=motion, backend=backend)
-    displacements, corrected = first.displacements, torch.zeros_like(first.lifted)
-    if config.rounds > 1:
+    displacements, corrected = first.displacements, 0
+    if config.rounds > 1 and fast_count > config.FEW_FAST * len(priors):
         second = residual_flow(
             moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, backend=backend
         )
-        displacements, corrected = displacements + second.displacements, second.lifted
-    counts = torch.stack([first.lifted, corrected, fast, fast & first.lifted]).sum(1).tolist()
-    moved = split.displaced(displacements)
-    return SceneFlow(moved, displacements, active_tiles, dict(zip(COUNTS, counts, strict=True)))
+        displacements, corrected = displacements + second.displacements, int(second.lifted.sum())
+        moved = split.displaced(displacements)
+    counts = dict(zip(COUNTS, (displaced, corrected, fast_count, fast_displaced), strict=True))
+    return SceneFlow(moved, displacements, active_tiles, counts)
 
 
 def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:
