@@ -21,6 +21,7 @@ SETTLED: Mapping[str, Any] = {
     "initial.losses.offset_distance_reading": "scaled",
     "initial.depth_distortion.weight": 0.0,
     "depth_distortion.weight": 0.0,
+    "online.extra_iterations": 0.0,
 }
 """Fields that some programs lack, with the value at which the others do the same: it makes no difference."""
 
