@@ -23,7 +23,7 @@ from tests.support.varied import varied
 from tests.support.worlds import moving_world
 
 FRAMES = 4
-WORLD = moving_world(FRAMES, cameras=6, speed=0.06, movers=20, emerges_at=2, width=96, height=64)
+WORLD = moving_world(FRAMES, cameras=6, speed=0.16, movers=40, emerges_at=2, width=128, height=96)
 POINTS = WORLD.scene.anchors.positions.numpy().astype(float)
 CONFIG = replace(
     COMPACT,
@@ -53,6 +53,7 @@ def test_every_part_acts_and_is_counted() -> None:
     assert not counts[0]
     assert all(count["displaced"] > 0 for count in counts[1:])
     assert all(count["corrected"] > 0 for count in counts[1:])
+    assert [report.iterations for report in whole()[1][1:]] == [12, 12, 12]
     assert not any(count["scene cuts"] or count["views left out"] for count in counts[1:])
 
 

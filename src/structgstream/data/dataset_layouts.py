@@ -345,7 +345,7 @@ def bundled_clip() -> FrameSource:
 
 MIN_COMMON = 3
 MAX_OFF = 0.03
-"""Largest residual of a camera position after alignment, as a share of the rig's extent."""
+"""Largest residual of a camera position after alignment, as a share of the extent of the cameras that match."""
 
 
 def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | None:
@@ -371,11 +371,10 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     )
     theirs = np.array([posed.center for posed in found.values()])
     ours = np.array([rig[name].center.numpy() for name in found])
-    extent = np.linalg.norm(np.ptp([camera.center.numpy() for camera in rig.cameras.values()], axis=0))
-    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / extent
+    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
     if not off <= MAX_OFF:
         log.warning(
-            "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
+            "The cameras of %s lie up to %.0f %% of their extent away from the rig's; its points are not used.",
             model.where, 100 * off,
         )  # fmt: skip
         return None

@@ -24,8 +24,8 @@ StateT = TypeVar("StateT", bound=Drawable)
 class FrameReport:
     """The report of one frame.
 
-    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors. ``field_bytes`` are the packet's
-    bytes by field.
+    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors, ``iterations`` the optimisation
+    steps. ``field_bytes`` are the packet's bytes by field.
 
     Peaks of memory are by stage: ``read``, ``fit``, ``store`` (encoding and writing), and ``prepare`` (computing frame
     0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
@@ -49,6 +49,7 @@ class FrameReport:
     pruned: int
     grown: int = 0
     removed: int = 0
+    iterations: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)
     peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
     peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
@@ -101,6 +102,7 @@ class FrameMeter:
             pruned=fit.pruned,
             grown=fit.grown,
             removed=fit.removed,
+            iterations=fit.iterations,
             counts=dict(fit.counts),
             losses=dict(fit.losses),
             seconds={**read, **fit.seconds, **self._seconds, "total": self._last - self._started},

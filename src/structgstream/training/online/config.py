@@ -76,7 +76,7 @@ class SceneFlowConfig:
 
     FEW_FAST: ClassVar[float] = 0.015
     """Share of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``), above which much does. Up to it these
-    may be errors of optical flow: where nothing moves fast they are 0.01 at most."""
+    may be errors of optical flow: where nothing moves fast they were 0.011 at most."""
 
 
 @dataclass(frozen=True)
@@ -294,8 +294,8 @@ class OnlineConfig:
     iterations: int = 100
     """Optimisation steps per frame (paper: 100); fewer where the dynamic part is not in all views."""
     extra_iterations: float = 0.0
-    """Further steps of a frame in which much moves fast, as a share of ``iterations``: all of them from ``MANY_FAST``
-    on, in proportion fewer down to ``SceneFlowConfig.FEW_FAST`` (not in the paper)."""
+    """Further steps of a frame in which much moves fast, as a share of ``iterations``: all of them if 4 % of the
+    dynamic primitives do, none below 1.5 %, or without scene flow (not in the paper)."""
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
     appearance_rank: int = 4

@@ -130,7 +130,6 @@ def fit_next_frame(
         counts={
             **result.counts,
             **flow.counts,
-            "iterations": result.iterations,
             **spawned.counts,
             "propagated": selection.occluded_count,
             **pictures.flow_counts,

@@ -2,9 +2,9 @@
 """Initial scene flow: optical flow displaces dynamic primitives before the first iteration (not in the paper).
 
 The gradient of a picture loss leads a Gaussian to its new position only while both overlap in the picture. Optical flow
-covers larger displacements, so that fast motion leaves no blur and no ghosts. There are two rounds: flow from the
-previous pictures to these, and then, after displacing the primitives (Note [Primitives]), where much moves fast, flow
-from the rendering to these pictures, which also corrects errors of earlier frames.
+covers larger displacements, so that fast motion leaves no blur and no ghosts. In a first round flow leads from the
+previous pictures to these. Where much moves fast a second one follows, after displacing the primitives
+(Note [Primitives]): flow from the rendering to these pictures, which also corrects errors of earlier frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,10 +59,14 @@ class LiftedFlow:
     Args:
         displacements: ``[T, 3]``.
         lifted: mask ``[T]`` of those fitted to flow; the others have their prior.
+        fast: mask ``[T]`` of those whose flow exceeds :data:`FAST_SHARE`.
+        fast_count: how many these are.
     """
 
     displacements: Tensor
     lifted: Tensor
+    fast: Tensor
+    fast_count: int
 
 
 def lift_flow(
@@ -85,10 +89,12 @@ def lift_flow(
     Raises:
         MissingExtraError: SciPy is not installed.
     """
-    points, informed = on_processor(centers, evidence.weights.amax(0) > 0)  # Where neighbours are looked for.
+    fast = _is_fast(evidence, views)
+    # Where neighbours are looked for.
+    points, informed, fast_here = on_processor(centers, evidence.weights.amax(0) > 0, fast)
     informed = informed.nonzero()[:, 0]
     if not len(informed):
-        return LiftedFlow(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
+        return LiftedFlow(priors, torch.zeros_like(fast), fast, 0)
     near, distances = nearest(points, points[informed], NEIGHBOURS)
     neighbours, affinities = informed[near].to(centers.device), weights_by_distance(distances.to(centers.device))
     apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
@@ -108,7 +114,7 @@ def lift_flow(
     found = backend.lift(centers, seen, Neighbors(neighbours, affinities), priors, share=INLIER_SHARE)
     lifted = (found.inlier_share > INLIER_SHARE) & (found.agreeing_views >= AGREEING_VIEWS)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
-    return LiftedFlow(displacements, lifted)
+    return LiftedFlow(displacements, lifted, fast, int(fast_here.sum()))
 
 
 FAST_SHARE = 1 / 80
@@ -186,20 +192,18 @@ def apply_scene_flow(
     evidence, centers = selection.evidence.select(dynamic), selection.centers[dynamic]
     views_with_flow = [view for view in views if view.index in selection.views_with_flow]
     first = lift_flow(evidence, centers, priors, views_with_flow, backend=backend)
-    fast = _is_fast(evidence, views_with_flow)
-    displaced, fast_count, fast_displaced = torch.stack([first.lifted, fast, fast & first.lifted]).sum(1).tolist()
 
     moved = split.displaced(first.displacements)
     active_tiles = find_active_tiles(moved, views, config=motion, backend=backend)
-    displacements, corrected = first.displacements, 0
-    if config.rounds > 1 and fast_count > config.FEW_FAST * len(priors):
+    displacements, corrected = first.displacements, torch.zeros_like(first.lifted)
+    if config.rounds > 1 and first.fast_count > config.FEW_FAST * len(priors):
         second = residual_flow(
             moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, backend=backend
         )
-        displacements, corrected = displacements + second.displacements, int(second.lifted.sum())
+        displacements, corrected = displacements + second.displacements, second.lifted
         moved = split.displaced(displacements)
-    counts = dict(zip(COUNTS, (displaced, corrected, fast_count, fast_displaced), strict=True))
-    return SceneFlow(moved, displacements, active_tiles, counts)
+    counts = torch.stack([first.lifted, corrected, first.fast, first.fast & first.lifted]).sum(1).tolist()
+    return SceneFlow(moved, displacements, active_tiles, dict(zip(COUNTS, counts, strict=True)))
 
 
 def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:
@@ -239,7 +243,8 @@ def residual_flow(
     seen = [view for view in views if view.index in active_tiles]
     nothing = torch.zeros(len(dynamic.anchors) + len(dynamic.free), 3).to(dynamic.anchors.positions)
     if not seen:
-        return LiftedFlow(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
+        none = torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device)
+        return LiftedFlow(nothing, none, none, 0)
     folded = dynamic.with_folded_appearance()
     with torch.no_grad():
         found = by_size(
