@@ -236,7 +236,8 @@ class PatchingConfig:
     """Choice of parents: ``gradient`` (paper), ``random`` (as many, drawn at random), ``uniform`` (the same, with
     children anywhere in the box of the anchors: the paper's ablation), ``off``."""
     iteration: int = 50
-    """Iteration after which patching is done, once per frame (paper: 50 of 100)."""
+    """Iteration after which patching is done, once per frame (paper: 50 of 100); in a frame with more, later in
+    proportion."""
     grad_threshold: float = 1e-3
     """The paper's tau_grad (0.001), on the mean view-space gradient in NDC (Note [View-space units])."""
     collect_from: int = 0
