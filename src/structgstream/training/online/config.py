@@ -76,7 +76,7 @@ class SceneFlowConfig:
 
     FEW_FAST: ClassVar[float] = 0.015
     """Share of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``), above which much does. Up to it these
-    may be errors of optical flow: where nothing moves fast they were 0.011 at most."""
+    may be errors of optical flow: where nothing moves fast they were 0.01 at most."""
 
 
 @dataclass(frozen=True)
