@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sound in a stream: records, damage, cuts, and what is continued (docs/bitstream.md, section Sound)."""
 
+import math
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -128,6 +129,14 @@ def test_a_damaged_sound_costs_no_frame() -> None:
     assert reader.cut_reason.endswith("no frame is lost")
     assert [reader.sound(i) for i in range(FRAMES)] == [None, *sounds()[1:]]
     assert reader.scene(FRAMES - 1) is not None
+
+
+def test_a_sound_record_that_violates_the_format_costs_no_frame() -> None:
+    records = [*scan_records(data := whole_stream())]
+    first = next(record for record in records if record.type == RecordType.SOUND)
+    wrong = packed(RecordType.SOUND, replace(sounds()[0], seconds=math.nan).pack())
+    reader = StreamReader(data[: first.offset] + wrong + data[first.end : records[-1].offset])
+    assert [reader.sound(index) for index in range(FRAMES)] == [None, *sounds()[1:]]
 
 
 def test_sound_is_found_behind_the_layers_of_a_packet() -> None:

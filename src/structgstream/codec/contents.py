@@ -209,13 +209,17 @@ class Packets(Sequence[PacketInfo]):
         return packet
 
     def sound(self, index: int) -> FrameSound | None:
-        """The sound that is stored with a frame that is not lost; None if there is none, or it is damaged."""
+        """The sound that is stored with a frame that is not lost; None if there is none, it is damaged, or it does not
+        follow the format."""
         head = read_head(self._data, self.offsets[index])
         found = None if head is None else self._sound_head(self.offsets[index] + head.bytes)
         record = None if found is None else read_record(self._data, found[0])
         if record is None:
             return None
-        sound = unpack_sound(record.payload)
+        try:
+            sound = unpack_sound(record.payload)
+        except StreamError:
+            return None
         return sound if sound.index == index else None
 
     def _sound_head(self, end: int) -> tuple[int, Head] | None:
