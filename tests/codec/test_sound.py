@@ -131,12 +131,13 @@ def test_a_damaged_sound_costs_no_frame() -> None:
     assert reader.scene(FRAMES - 1) is not None
 
 
-def test_a_sound_record_that_violates_the_format_costs_no_frame() -> None:
+def test_a_sound_record_that_violates_the_format_costs_no_frame(caplog: pytest.LogCaptureFixture) -> None:
     records = [*scan_records(data := whole_stream())]
     first = next(record for record in records if record.type == RecordType.SOUND)
     wrong = packed(RecordType.SOUND, replace(sounds()[0], seconds=math.nan).pack())
     reader = StreamReader(data[: first.offset] + wrong + data[first.end : records[-1].offset])
     assert [reader.sound(index) for index in range(FRAMES)] == [None, *sounds()[1:]]
+    assert "The sound record of frame 0 does not follow the format. The frame is silent." in caplog.text
 
 
 def test_sound_is_found_behind_the_layers_of_a_packet() -> None:

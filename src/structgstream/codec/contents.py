@@ -2,6 +2,7 @@
 """What a stream holds: packets and periods, found by reading every record, or by its index; and after damage, where
 whole records go on (docs/bitstream.md, section Damage)."""
 
+import logging
 import math
 import re
 from array import array
@@ -31,6 +32,8 @@ from structgstream.codec.container.records import (
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.codec.sound import FrameSound, unpack_sound
 from structgstream.errors import StreamError
+
+log = logging.getLogger(__name__)
 
 _KNOWN_TYPES = frozenset(RecordType)
 MIN_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
@@ -209,8 +212,8 @@ class Packets(Sequence[PacketInfo]):
         return packet
 
     def sound(self, index: int) -> FrameSound | None:
-        """The sound that is stored with a frame that is not lost; None if there is none, it is damaged, or it does not
-        follow the format."""
+        """The sound that is stored with a frame that is not lost; None if there is none, it is damaged, or, with a
+        warning, it does not follow the format."""
         head = read_head(self._data, self.offsets[index])
         found = None if head is None else self._sound_head(self.offsets[index] + head.bytes)
         record = None if found is None else read_record(self._data, found[0])
@@ -218,7 +221,8 @@ class Packets(Sequence[PacketInfo]):
             return None
         try:
             sound = unpack_sound(record.payload)
-        except StreamError:
+        except StreamError as error:
+            log.warning("%s The frame is silent.", error)
             return None
         return sound if sound.index == index else None
 
