@@ -27,6 +27,7 @@ struct Pinhole {
 
 // alpha = 2^(log2_opacity - (xx dx^2 + xy dx dy + yy dy^2)), the conic scaled by log2(e) / 2 (xy by log2(e)).
 struct alignas(64) Splat {
+    Splat() {}                 // not set to zero: every splat is written before it is read
     float x, y;
     float xx, xy, yy;
     float log2_opacity;
@@ -41,6 +42,8 @@ struct alignas(64) Splat {
 struct Pair {
     int32_t splat;
     int32_t slot;
+    Pair() {}  // as Splat
+    Pair(int32_t splat, int32_t slot) : splat(splat), slot(slot) {}
 };
 
 struct Raster {

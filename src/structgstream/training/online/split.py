@@ -152,10 +152,10 @@ def changed_tiles(masks: Tensor, changed: Sequence[Tensor | None], size: tuple[i
     if not known:
         return masks
     everywhere = torch.ones_like(known[0])
-    pixels = torch.stack([everywhere if mask is None else mask for mask in changed])[:, None].float()
+    pixels = torch.stack([everywhere if mask is None else mask for mask in changed])[:, None].to(torch.uint8)
     rows, columns = masks.shape[1:]
     large = torch.nn.functional.interpolate(pixels, size=size)
     padded = torch.nn.functional.pad(large, (0, columns * TILE_PIXELS - size[1], 0, rows * TILE_PIXELS - size[0]))
-    of_tiles = padded.reshape(-1, rows, TILE_PIXELS, columns, TILE_PIXELS)  # max_pool2d takes twice the time
-    found = masks & (of_tiles.amax((2, 4)) > 0.0)
+    of_tiles = padded.reshape(-1, rows, TILE_PIXELS, columns, TILE_PIXELS)
+    found = masks & (of_tiles.amax(2).amax(3) > 0)  # both at once, in float, take three to five times as long
     return torch.where(found.flatten(1).any(1)[:, None, None], found, masks)
