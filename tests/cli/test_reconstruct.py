@@ -45,8 +45,8 @@ def test_few_cameras_are_told_at_the_start_what_to_expect(tmp_path: Path, capsys
     assert main([*asked, str(tmp_path / "few.sgs"), "--held-out", *most]) == 0
     first, second, *_ = capsys.readouterr().out.splitlines()
     assert "2 training cameras" in first
-    assert second.startswith("Warning: 2 cameras, about 59 degrees apart: expect about ")
-    assert "at viewpoints between them, where people and objects are torn (" in second
+    assert second.startswith("Warning: 2 cameras, about 59 degrees apart: expect 19 to 24 dB at ")
+    assert "at viewpoints between them, where people and objects may be torn (" in second
 
 
 def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:

@@ -42,6 +42,9 @@ MEASURED = (
 )  # fmt: skip
 """Spacing in degrees, and PSNR in dB of frame 0 at cameras that were held out, of two captures with 4 to 27 cameras
 (lab/notes/scaling.md, Few cameras far apart). At 54 degrees it is the mean of three seeds, which differ by 5 dB."""
+SPREAD = 1.15
+"""Factor by which the spacing between two cameras may differ from that of the rig: two sets of 8 cameras of one dome, 48
+and 54 degrees apart, gave 21.9 and, over three seeds, 19 to 24 dB."""
 GOOD_DEGREES = 20.0
 """What docs/film-it.md asks for: nothing is said of cameras that are closer."""
 WARNING_PSNR = 25.0
@@ -57,16 +60,11 @@ class Expectation:
 
     Args:
         sentence: number and spacing of the cameras, and the PSNR to expect, also with more cameras.
-        psnr: dB.
+        poor: whether new viewpoints may be hardly watchable.
     """
 
     sentence: str
-    psnr: float
-
-    @property
-    def poor(self) -> bool:
-        """Whether new viewpoints will be hardly watchable."""
-        return self.psnr < WARNING_PSNR
+    poor: bool
 
 
 def expected_psnr(degrees: float) -> float:
@@ -80,13 +78,14 @@ def expectation(cameras: Mapping[str, Camera]) -> Expectation | None:
     degrees, count = camera_spacing(cameras), len(cameras)
     if degrees <= GOOD_DEGREES:
         return None
-    psnr = expected_psnr(degrees)
+    low, high = expected_psnr(degrees * SPREAD), expected_psnr(degrees / SPREAD)
     enough = math.ceil(count * (degrees / GOOD_DEGREES) ** (1.0 / COUNT_EXPONENT))
     closer = {number: degrees * (count / number) ** COUNT_EXPONENT for number in (min(2 * count, enough), enough)}
     better = ", ".join(f"{expected_psnr(apart):.0f} with {number}" for number, apart in closer.items())
-    torn = ", where people and objects are torn" if psnr < WARNING_PSNR else ""
+    poor = low < WARNING_PSNR
+    torn = ", where people and objects may be torn" if poor else ""
     return Expectation(
-        f"{count} cameras, about {degrees:.0f} degrees apart: expect about {psnr:.0f} dB at viewpoints between "
-        f"them{torn} ({better}); add cameras, or move them closer together.",
-        psnr,
+        f"{count} cameras, about {degrees:.0f} degrees apart: expect {low:.0f} to {high:.0f} dB at viewpoints between "
+        f"them{torn} (about {better}); add cameras, or move them closer together.",
+        poor,
     )

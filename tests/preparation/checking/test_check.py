@@ -64,7 +64,7 @@ def test_cameras_that_are_too_far_apart_are_told_what_to_expect() -> None:
     assert not any("degrees apart" in finding.sentence for finding in checked().report.findings)
     far = rig.with_held_out(frozenset([*rig][1:-1]))
     found = check_capture(MemoryCapture(far, [frame])).report.findings
-    assert [f.severity for f in found if f.sentence.startswith("2 cameras, about 45 degrees apart")] == ["note"]
+    assert [f.severity for f in found if f.sentence.startswith("2 cameras, about 45 degrees apart")] == ["warning"]
 
 
 def test_the_camera_that_was_turned_is_named() -> None:
