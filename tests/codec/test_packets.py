@@ -23,7 +23,7 @@ from structgstream.codec.packets import (
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import STATE_TABLE
-from tests.support.streams import header_for, small_scene
+from tests.support.streams import compact_header, header_for, small_scene
 
 
 def test_both_sinks_take_packets(tmp_path: Path) -> None:
@@ -102,7 +102,8 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
     "true or false": lambda d: d.update(distance_input=1),
     "fields that packets do not carry": lambda d: d["dynamic"].pop(),
     "exactly the fields": lambda d: d["dynamic"].append("anchor_offsets"),
-    "must hold exactly": lambda d: d["dynamic"].append("tentacles"),
+    "field 'tentacles' in packets, which this version does not know": lambda d: d["dynamic"].append("tentacles"),
+    "coded with 'tiny'; this version knows": lambda d: d.update(codec="tiny", dynamic=[]),
     "unhashable": lambda d: d.update(dynamic=[[]]),
     r"field camera_color as \(2, 6\)": lambda d: d["cameras"][0].update(held_out=False),
     "hidden layer": lambda d: d.update(distance_input=False),
@@ -113,6 +114,13 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
 def test_descriptions_that_break_the_format(message: str) -> None:
     with pytest.raises(StreamError, match=message):
         unpack_header(edited(EDITS[message]))
+
+
+@pytest.mark.parametrize(("codec", "message"), [("tiny", "coded with 'tiny'"), ("raw", "codec 'raw' has no coding")])
+def test_coded_fields_of_another_codec(codec: str, message: str) -> None:
+    description, blocks = opened(pack_header(compact_header(small_scene())))
+    with pytest.raises(StreamError, match=message):
+        unpack_header(closed(json.dumps({**description, "codec": codec}).encode(), blocks))
 
 
 def test_static_fields_that_do_not_fit_each_other() -> None:

@@ -273,6 +273,7 @@ def unpack_header(payload: bytes) -> StreamHeader:
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
     if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
+        check_codec(header.codec)
         raise StreamError("The init record must hold exactly the fields that packets do not carry.")
     check_shapes(
         {**header.static, **header.reference},
@@ -281,6 +282,14 @@ def unpack_header(payload: bytes) -> StreamHeader:
         where="The init record",
     )
     return header
+
+
+def check_codec(codec: str) -> None:
+    """Raises StreamError if this version does not know the codec."""
+    if codec not in ("raw", "compact"):
+        raise StreamError(
+            f"The stream is coded with {codec!r}; this version knows 'raw' and 'compact'. Install a newer structgstream."
+        )
 
 
 def _complete(names: Set[FieldName]) -> bool:
@@ -293,6 +302,7 @@ def _fields(
 ) -> dict[FieldName, Tensor]:
     if description["codec"] != "compact":
         if coded:
+            check_codec(str(description["codec"]))
             raise StreamError(f"The init record holds field {next(iter(coded))} coded; codec 'raw' has no coding.")
         return values
     if plain := sorted(values.keys() - UNCODED_FIELDS):
@@ -318,6 +328,11 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
     flags = [description["distance_input"], description.get("periods", False)]
     if not all(isinstance(value, dict) for value in plain) or not all(isinstance(value, bool) for value in flags):
         raise TypeError("config and metadata must be objects, distance_input and periods true or false")
+    if unknown := sorted(map(repr, dynamic - FIELDS.keys())):
+        raise StreamError(
+            f"The init record announces field {unknown[0]} in packets, which this version does not know; install a newer "
+            "structgstream."
+        )
     return StreamHeader(
         rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),

@@ -31,7 +31,7 @@ from structgstream.codec.fields.packet_fields import (
     dequantize_state,
     quantize_state,
 )
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, check_shapes, packet_from_blocks
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, check_codec, check_shapes, packet_from_blocks
 from structgstream.errors import StreamError
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
@@ -53,15 +53,11 @@ class CompactCoder:
     """Encodes or decodes the frames of one stream in order; decoding may start at any key packet.
 
     Raises:
-        StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
+        StreamError: the header has an unknown codec, dynamic fields that cannot be coded, or no step or reference for one.
     """
 
     def __init__(self, header: StreamHeader) -> None:
-        if header.codec != "compact":
-            raise StreamError(
-                f"The stream is coded with {header.codec!r}; this version knows 'raw' and 'compact'. "
-                "Install a newer structgstream."
-            )
+        check_codec(header.codec)
         if beyond := header.dynamic - CODABLE:
             raise StreamError(f"The compact codec has no coding for {', '.join(sorted(beyond))}; keep it static.")
         if header.dynamic & FREE_FIELDS not in (frozenset(), FREE_FIELDS):
