@@ -302,7 +302,7 @@ def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
         "similarity": first.similarity != later.similarity,
         "frames a second": first.fps != later.fps,
         "codec": first.codec != later.codec,
-        "sound": first.sound != later.sound,
+        "sound": (first.sound, first.unknown_sound) != (later.sound, later.unknown_sound),
     }
     return [name for name, differs in found.items() if differs]
 

@@ -47,7 +47,8 @@ class StreamHeader:
         init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
             (``static_fields.py``), each a float32 number.
         periods: whether other periods, with init records of their own, may follow.
-        sound: what is stored beside the frames; None for no sound.
+        sound: what is stored beside the frames; None for no sound, or one of a codec that this version does not know.
+        unknown_sound: what a read init record states of such a sound; it is not written.
     """
 
     rig: CameraRig
@@ -64,6 +65,7 @@ class StreamHeader:
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
     periods: bool = False
     sound: SoundFormat | None = None
+    unknown_sound: Mapping[str, Any] | None = None
 
     def camera(self, camera: Camera | str) -> Camera:
         """A camera in the normalised units of the decoded scenes; it shows the same picture.
@@ -333,6 +335,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
             f"The init record announces field {unknown[0]} in packets, which this version does not know; install a newer "
             "structgstream."
         )
+    sound = sound_format(description.get("sound"))
     return StreamHeader(
         rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
@@ -347,7 +350,8 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         init_steps=_steps(description.get("init_steps", {})),
         reference={name: value for name, value in static.items() if name in dynamic},
         periods=flags[1],
-        sound=sound_format(description.get("sound")),
+        sound=sound,
+        unknown_sound=None if sound else description.get("sound"),
     )
 
 
