@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from structgstream import sequence_import
 from structgstream.cli import main
-from structgstream.codec.fields.packet_fields import MAX_FREE
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.errors import CaptureError
@@ -30,7 +30,7 @@ def write(folder: Path, parts: Sequence[BakedGaussians]) -> list[Path]:
     return [write_gaussians(folder / f"frame_{t}.ply", part, format="ply") for t, part in enumerate(parts)]
 
 
-def imported(folder: Path, parts: Sequence[BakedGaussians], *, max_splats: int = MAX_FREE) -> ImportedSequence:
+def imported(folder: Path, parts: Sequence[BakedGaussians], *, max_splats: int | None = None) -> ImportedSequence:
     files = write(folder, parts)
     output, backend = folder / "out.sgs", quickest_backend()
     return import_sequence(files, output, fps=2.0, backend=backend, rig=RIG, max_splats=max_splats)
@@ -99,6 +99,15 @@ def test_a_budget_leaves_the_most_important(tmp_path: Path) -> None:
     assert imported(tmp_path, parts, max_splats=30).counts == (30, 30)
     rows = parts[0].by_importance()[:30]
     check(tmp_path / "out.sgs", [part.select(rows) for part in parts])
+
+
+def test_what_a_stream_cannot_hold_is_left_out_only_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sequence_import, "MAX_FREE", 50)
+    with pytest.raises(CaptureError, match="80 Gaussians, and a stream at most 50; add --max-splats 50"):
+        imported(tmp_path, moving(1))
+    assert imported(tmp_path, moving(1), max_splats=50).counts == (50, 50)
 
 
 @pytest.mark.parametrize("linked", [True, False])

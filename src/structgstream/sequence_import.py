@@ -78,7 +78,7 @@ def import_sequence(
     backend: Backend,
     rig: CameraRig | None = None,
     down: tuple[float, float, float] = (0.0, 1.0, 0.0),
-    max_splats: int = MAX_FREE,
+    max_splats: int | None = None,
     on_frame: Callable[[], object] = lambda: None,
 ) -> ImportedSequence:
     """Writes a stream of ``.ply`` files, one for each frame (Note [Imported sequences]).
@@ -86,7 +86,8 @@ def import_sequence(
     Args:
         rig: cameras in the units of the files; None for a ring around the Gaussians of the first file.
         down: direction of gravity, for the ring.
-        max_splats: largest number of Gaussians of a frame; the smallest and most transparent are left out.
+        max_splats: largest number of Gaussians of a frame, at most :data:`MAX_FREE`; the smallest and most transparent
+            are left out. None for all of them.
 
     Raises:
         CaptureError: a file is not a ``.ply`` of Gaussians, is damaged or has too many Gaussians.
@@ -100,8 +101,10 @@ def import_sequence(
     if empty := [file.name for file, header in zip(files, headers, strict=True) if not header.count]:
         raise CaptureError(f"{empty[0]} has no Gaussian.")
     largest = max(header.count for header in headers)
-    if largest > max_splats == MAX_FREE:
-        raise CaptureError(f"A frame has {largest:,} Gaussians, and a stream at most {MAX_FREE:,}; add --max-splats.")
+    if max_splats is None and largest > MAX_FREE:
+        raise CaptureError(
+            f"A frame has {largest:,} Gaussians, and a stream at most {MAX_FREE:,}; add --max-splats {MAX_FREE}."
+        )
     first = read_ply(files[0])
     rig = rig or ring_around(first, down)
     similarity = normalizing_similarity(rig, radius=1.0)
@@ -189,7 +192,7 @@ def ring_around(gaussians: BakedGaussians, down: tuple[float, float, float]) -> 
     return CameraRig(cameras)
 
 
-def _chosen(gaussians: BakedGaussians, max_splats: int, reach: float) -> Tensor:
+def _chosen(gaussians: BakedGaussians, max_splats: int | None, reach: float) -> Tensor:
     """Rows of the most important Gaussians within ``reach`` along each axis, neighbours in space next to each other."""
     rows = gaussians.by_importance()
     rows = rows[gaussians.means[rows].abs().amax(1) <= reach][:max_splats]

@@ -223,7 +223,7 @@ def import_files(arguments: list[str]) -> None:
             backend=select_backend(options.device),
             rig=None if options.capture is None else open_capture(options.capture).rig,
             down=(sign * x, sign * y, sign * z),
-            max_splats=options.max_splats or MAX_FREE,
+            max_splats=options.max_splats,
             on_frame=advance,
         )
     console, size_bytes = Console(), output.stat().st_size
