@@ -290,7 +290,8 @@ def check_codec(codec: str) -> None:
     """Raises StreamError if this version does not know the codec."""
     if codec not in ("raw", "compact"):
         raise StreamError(
-            f"The stream is coded with {codec!r}; this version knows 'raw' and 'compact'. Install a newer structgstream."
+            f"The stream is coded with {codec!r}; this version knows 'raw' and 'compact'. "
+            "Install a newer structgstream."
         )
 
 
@@ -332,8 +333,8 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         raise TypeError("config and metadata must be objects, distance_input and periods true or false")
     if unknown := sorted(map(repr, dynamic - FIELDS.keys())):
         raise StreamError(
-            f"The init record announces field {unknown[0]} in packets, which this version does not know; install a newer "
-            "structgstream."
+            f"The init record announces field {unknown[0]} in packets, which this version does not know; "
+            "install a newer structgstream."
         )
     sound = sound_format(description.get("sound"))
     return StreamHeader(
