@@ -12,13 +12,13 @@ import pytest
 
 from structgstream.cli import main, render
 from structgstream.cli.options import parse_options
-from structgstream.codec.reader import open_stream
+from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.evaluation.camera_path import central_camera
 from tests.support.backends import QUICKEST
 from tests.support.drawn import pixels_of
 from tests.support.quick_streams import CLIP, error_of
-from tests.support.streams import header_for, small_scene, write_stream
+from tests.support.streams import header_for, small_scene, small_stream, write_stream
 
 
 def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:
@@ -81,7 +81,10 @@ def test_time_on_a_path_runs_with_the_camera_or_forth_and_back(
     """Views and frames of a path as long as the stream, which may lack frames, and of a longer one."""
     packets = [SimpleNamespace(pts_seconds=time / 30) for time in times]
     reader: Any = SimpleNamespace(
-        packets=packets, header=SimpleNamespace(fps=30.0), scenes=lambda _: zip(packets, range(3), strict=True)
+        packets=SimpleNamespace(at=packets.__getitem__),
+        runs=[range(3)],
+        header=SimpleNamespace(fps=30.0),
+        scene=lambda number: number,
     )
     views: Any = range(count)
     assert list(render._along(reader, views, None)) == frames
@@ -107,9 +110,30 @@ def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> 
 def test_a_stream_without_frames_is_not_rendered_nor_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = tmp_path / "empty.sgs"
     write_stream(FileSink(empty), [], header=header_for(small_scene()))
-    for more in ([], ["--path", "orbit"]):
+    for more in ([], ["--path", "orbit"], ["--frame", "0"]):
         assert "no whole frame" in error_of(["render", str(empty), *more], capsys, status=2)
     assert "no whole frame, so there is nothing to score" in error_of(["evaluate", str(empty), CLIP], capsys, status=2)
+
+
+def test_lost_frames_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As they are in a stream with a window; here packets are damaged, and no index is whole."""
+    data = bytearray(small_stream(frames=5)[:-1])
+    for lost in (0, 2):
+        data[StreamReader(bytes(data)).packets.at(lost).offset + 20] ^= 1
+    (tmp_path / "late.sgs").write_bytes(data)
+    base = ["render", str(tmp_path / "late.sgs"), "--device", QUICKEST]
+    assert main([*base, "-o", str(tmp_path / "all")]) == 0
+    assert sorted(entry.name for entry in (tmp_path / "all").iterdir()) == [f"0000{i}.png" for i in (1, 3, 4)]
+    assert "The stream has frames 1 to 1 and 3 to 4; those that are lost are left out." in capsys.readouterr().err
+    assert main([*base, "-o", str(tmp_path / "3.png"), "--frame", "3"]) == 0
+    assert (tmp_path / "3.png").read_bytes() == (tmp_path / "all" / "00003.png").read_bytes()
+    for path in ([], ["--path", "orbit", "--seconds", "0.1"]):
+        assert main([*base, "-o", str(tmp_path / "v.mp4"), *path]) == 0
+        with av.open(str(tmp_path / "v.mp4")) as container:
+            assert [round(30 * one.time) for one in container.decode(video=0)] == [0, 1, 2]
+    assert "frames 1 to 1 and 3 to 4; there is no frame 0" in error_of([*base, "--frame", "0"], capsys, status=2)
+    compared = error_of([base[0], base[1], CLIP, "--compare"], capsys, status=2)
+    assert "before the first lost one, which is frame 0" in compared
 
 
 def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:

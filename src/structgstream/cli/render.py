@@ -3,14 +3,14 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import UsageError
+from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
 from structgstream.cli.progress import print_lines
 
@@ -74,12 +74,13 @@ def main(arguments: list[str]) -> None:
     if options.between is not None and options.path != "arc":
         raise UsageError("--between gives the ends of --path arc.")
     from structgstream.codec.reader import open_stream
+    from structgstream.exporters.formats import choose_frames
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream, by_index=options.frame is not None)
-    if not reader.packets:
-        raise UsageError("the stream has no whole frame, so there is nothing to render.")
     output = options.output or default_output(options, reader)
+    with usage_errors():
+        choose_frames(reader.runs, output, frame=options.frame, frames=None)
     if output.suffix.lower() == ".png" and options.frame is None:
         raise UsageError("a PNG holds one picture: choose it with --frame, or write an .mp4 or a folder.")
     backend = select_backend(options.device)
@@ -104,6 +105,9 @@ def main(arguments: list[str]) -> None:
     in_step = options.frame is None and is_whole_path
     if has_sound and not in_step:
         print_lines(Console(stderr=True), "The video has no sound, because it does not show the stream as it is.")
+    if options.frame is None and not options.compare and reader.runs != [range(len(reader))]:
+        there = " and ".join(f"{run.start} to {run.stop - 1}" for run in reader.runs)
+        print_lines(Console(stderr=True), f"The stream has frames {there}; those that are lost are left out.")
     write_pictures(output, pictures, fps=reader.header.fps, shown=reader if in_step else None)
     print_lines(Console(), f"Wrote {output}")
 
@@ -114,29 +118,30 @@ def write_pictures(
     """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``.
 
     Args:
-        shown: the stream whose frames the pictures show, one after the other; a video gets their times and its sound.
+        shown: the stream whose frames the pictures show, one after the other; files get their numbers, a video gets
+            their times and its sound.
     """
     from structgstream.data.sound import SoundDecoder
     from structgstream.data.video_writer import VideoWriter
     from structgstream.evaluation.pictures import write_png
 
+    frames = zip(count(), repeat(0.0)) if shown is None else _shown_frames(shown)
     with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
             format = None if shown is None else shown.header.sound
             decoder = None if format is None else SoundDecoder(format.channels)
             with VideoWriter(output, fps=fps, channels=None if format is None else format.channels) as video:
-                for number, picture in enumerate(pictures):
+                for (number, start), picture in zip(frames, pictures):
                     if shown is None:
                         video.write(picture)
                     else:
-                        start = shown.packets[0].pts_seconds
-                        video.write(picture, seconds=shown.packets[number].pts_seconds - start)
+                        video.write(picture, seconds=shown.packets.at(number).pts_seconds - start)
                         if decoder is not None and (sound := shown.sound(number)) is not None:
                             samples = decoder.decode(sound.packets, sound.seconds)
                             video.write_sound(samples, seconds=sound.seconds - start)
                     status.update(f"rendering picture {number + 1}")
             return
-        for number, picture in enumerate(pictures):
+        for (number, _), picture in zip(frames, pictures):
             write_png(output if output.suffix.lower() == ".png" else output / f"{number:05d}.png", picture)
             status.update(f"rendering picture {number + 1}")
 
@@ -179,19 +184,13 @@ def path_pictures(
 
 def path_length(reader: "StreamReader", seconds: float | None) -> int:
     """The views of a camera path of this duration, at the stream's rate; None: the stream's, or a little longer."""
-    from structgstream.evaluation.byte_count import shown_seconds
-
-    fps = reader.header.fps
-    length = max(shown_seconds(reader.packets, fps), MIN_PATH_SECONDS) if seconds is None else seconds
-    return max(round(length * fps), 1)
+    length = max(_seconds(reader, *reader.runs), MIN_PATH_SECONDS) if seconds is None else seconds
+    return max(round(length * reader.header.fps), 1)
 
 
 def is_in_step(reader: "StreamReader", count: int) -> bool:
     """Whether the stream lasts as long as a path of ``count`` views, which then shows it at its speed."""
-    from structgstream.evaluation.byte_count import shown_seconds
-
-    fps = reader.header.fps
-    return round(shown_seconds(reader.packets, fps) * fps) >= count
+    return round(_seconds(reader, *reader.runs) * reader.header.fps) >= count
 
 
 def compared_pictures(
@@ -203,7 +202,11 @@ def compared_pictures(
     from structgstream.evaluation.recording import capture_of
 
     camera = choose_camera(reader, options.camera)
-    _check_frame(reader, options.frame)
+    if (options.frame or 0) >= len(reader.packets):
+        raise UsageError(
+            f"--compare shows the frames before the first lost one, which is frame {len(reader.packets)}; without it "
+            "render reaches all that are there."
+        )
     pairs = compared_frames(
         reader, capture_of(reader.header, scene, frames=len(reader.packets)), backend=backend, camera=camera
     )
@@ -227,13 +230,9 @@ def choose_camera(reader: "StreamReader", camera: str | None) -> str:
 
 
 def scenes_of(reader: "StreamReader", frame: int | None) -> "Iterator[Scene]":
-    """All decoded scenes, or that of one frame."""
-    _check_frame(reader, frame)
-    if frame is not None:
-        yield reader.scene(frame)
-        return
-    for _, scene in reader.scenes(0):
-        yield scene
+    """The scenes of all frames that can be decoded, or that of one frame."""
+    for run in reader.runs if frame is None else [range(frame, frame + 1)]:
+        yield from map(reader.scene, run)
 
 
 def default_output(options: Render, reader: "StreamReader") -> Path:
@@ -249,12 +248,11 @@ def _along(reader: "StreamReader", views: "Sequence[Camera]", frame: int | None)
     """The views of a path, which are a frame's distance apart, with the scenes that they show."""
     count = len(views)
     if frame is None and is_in_step(reader, count):
-        start = reader.packets[0].pts_seconds
-        for info, scene in reader.scenes(0):
-            place = round((info.pts_seconds - start) * reader.header.fps)
+        for number, start in _shown_frames(reader):
+            place = round((reader.packets.at(number).pts_seconds - start) * reader.header.fps)
             if place >= count:
                 return
-            yield views[place], scene
+            yield views[place], reader.scene(number)
         return
     # A stream shorter than the path fits in memory: its scenes share static fields.
     scenes = list(scenes_of(reader, frame))
@@ -262,6 +260,19 @@ def _along(reader: "StreamReader", views: "Sequence[Camera]", frame: int | None)
         yield view, scenes[round((len(scenes) - 1) * (1.0 - abs(1.0 - 2.0 * number / count)))]
 
 
-def _check_frame(reader: "StreamReader", frame: int | None) -> None:
-    if frame is not None and not 0 <= frame < len(reader.packets):
-        raise UsageError(f"the stream has frames 0 to {len(reader.packets) - 1}; there is no frame {frame}.")
+def _shown_frames(reader: "StreamReader") -> "Iterator[tuple[int, float]]":
+    """The frames that can be decoded, each with the presentation time at which its video begins, seconds. Lost frames
+    are left out with their time, which can be hours where they have left a stream's window."""
+    before = 0.0
+    for run in reader.runs:
+        start = reader.packets.at(run.start).pts_seconds - before
+        yield from zip(run, repeat(start))
+        before += _seconds(reader, run)
+
+
+def _seconds(reader: "StreamReader", *runs: range) -> float:
+    """How long the stream shows the frames of these runs."""
+    from structgstream.evaluation.byte_count import shown_seconds
+
+    ends = ([reader.packets.at(run.start), reader.packets.at(run.stop - 1)] for run in runs)
+    return sum(shown_seconds(two, reader.header.fps) for two in ends)

@@ -53,8 +53,8 @@ class CompactCoder:
     """Encodes or decodes the frames of one stream in order; decoding may start at any key packet.
 
     Raises:
-        StreamError: the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or reference
-            for one.
+        StreamError: the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or
+            reference for one.
     """
 
     def __init__(self, header: StreamHeader) -> None:

@@ -156,7 +156,7 @@ def choose_frames(
 ) -> list[int]:
     """Numbers of the frames to write, of the ``runs`` that can be decoded. Raises ConfigError if there is no such
     frame, it is lost, or several would be written into a file that contains one."""
-    if not runs:
+    if not any(runs):
         raise ConfigError("the stream has no whole frame.")
     if frame is None and frames is None:
         numbers = [index for run in runs for index in run]
