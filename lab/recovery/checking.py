@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What ``structgstream prepare --check`` finds in captures that were spoiled on purpose.
 
-``python -m lab.recovery.checking CAPTURE [CAPTURE ...] --json lab/results/checking.json`` checks each capture as it is,
+``python -m lab.recovery.checking CAPTURE [CAPTURE ...] --json build/checking.json`` checks each capture as it is,
 and with each mistake of ``MISTAKES`` made in one of its cameras or in all; ``python -m lab.recovery.checking table
 FILE`` prints a result as Markdown. Nothing is written into the captures.
 """

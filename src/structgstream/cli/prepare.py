@@ -30,7 +30,7 @@ class Prepare:
     undistorted when frames are read. After Ctrl-C, or with other options, the same command does what is missing.
 
     With --check, checks a capture of any layout, writes its report, and exits with status 1 and one sentence when
-    something is wrong. See docs/captures.md.
+    it finds an error. See docs/captures.md.
 
     Example: structgstream prepare videos -o capture --held-out auto
 

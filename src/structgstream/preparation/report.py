@@ -227,7 +227,7 @@ MAX_PAIRS = 6
 
 
 def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: str) -> None:
-    """A camera's picture; each keypoint is joined with where the point of the other cameras falls."""
+    """A camera's picture; the colour of each keypoint is its distance from where the other cameras' point falls."""
     camera, tracks = examined.cameras[name], examined.tracks
     figure = figure_of(WIDTH_INCHES, 0.9 * WIDTH_INCHES * camera.height / camera.width + 0.4)
     axis = figure.subplots()

@@ -5,8 +5,8 @@ Note [State table]
 ~~~~~~~~~~~~~~~~~~
 This is the only list of fields. The optimiser reads the parameters of the dynamic fields and their learning rates from
 it; ``codec/fields`` rounds them, estimates the rate of their changes and codes them, by their rows alone. The init
-record contains the static fields and packets the dynamic ones, in the coding stated here. Half of the paper's ablations
-are edits of the dynamic set. The order of rows is the order of fields in a stream.
+record contains the static fields and packets the dynamic ones, in the coding stated here. A third of the paper's
+ablations are edits of the dynamic set. The order of rows is the order of fields in a stream.
 """
 
 from collections.abc import Iterable, Mapping

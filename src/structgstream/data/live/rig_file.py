@@ -70,7 +70,8 @@ class LiveRig:
     calibration: Path  # folder of the capture that has the cameras' calibration
     cameras: Mapping[str, LiveCamera]  # by name, in the order of the file
     fps: float | None = None
-    """Maximum number of frames per second, stated in the header; None for that of the calibration."""
+    """Frames per second, stated in the header; None for that of the calibration. Faster cameras give up to 4/3 of it
+    (``synchronizer.py``, MIN_SPACING)."""
     clock: TimeBase = TimeBase.ARRIVAL  # which clock states when a picture was taken
     tolerance_seconds: float | None = None
     """Maximum distance of a picture of a set from its instant; None for half a frame period."""

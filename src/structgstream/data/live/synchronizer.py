@@ -62,7 +62,7 @@ class FrameSynchronizer:
 
     Args:
         cameras: names, in the rig's order.
-        fps: maximum number of sets per second.
+        fps: frames per second of the stream; sets are at least :data:`MIN_SPACING` of a period apart.
         tolerance_seconds: maximum distance of a picture from the instant.
         deadline_seconds: how long a set waits for its pictures.
         queue_frames: maximum number of waiting pictures of a camera; the oldest are dropped.
