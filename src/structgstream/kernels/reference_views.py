@@ -84,7 +84,7 @@ class ViewByView:
                 sampling_intervals=sampling_intervals,
             ).gaussians
             if of_slots is not None:
-                structured = replace(structured, sampling_intervals=of_slots[structured.ids])
+                structured = replace(structured, sampling_intervals=of_slots.index_select(0, structured.ids))
             found.append(concatenate(structured, free) if len(free) else structured)
         return found
 
