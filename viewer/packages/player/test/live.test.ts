@@ -2,7 +2,9 @@
 /** Live streams from segments folders: engine, decoder and fetcher together, without a browser. */
 
 import { existsSync, readdirSync, readFileSync } from "node:fs";
+import { HEAD_BYTES } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
+import { PREFIX_BYTES } from "../../core/src/records.ts";
 import { AbrController } from "../src/decode/abrController.ts";
 import { Throughput } from "../src/decode/throughput.ts";
 import { Host, LiveRun, type RunOptions } from "./liveRun.ts";
@@ -368,6 +370,101 @@ test("periods are crossed without a break, in both directions", async () => {
   expect(host.asked("init-0001")).toBe(1);
 });
 
+describe("an init record that cannot be had costs its period", () => {
+  /** A stream whose init record has the right checksum, and states a longer description than it holds. */
+  const unreadable = CLIP.slice();
+  new DataView(unreadable.buffer).setUint32(PREFIX_BYTES + HEAD_BYTES, 2 ** 31, true);
+
+  test.each([
+    { problem: "missing", period: 0, requests: 3, reason: /not found on the server/ },
+    { problem: "missing", period: 1, requests: 3, reason: /not found on the server/ },
+    { problem: "another", period: 1, requests: 3, reason: /not the file that the manifest states/ },
+    { problem: "unreadable", period: 1, requests: 1, reason: /longer description than it holds/ },
+  ])("of period $period of a recording: $problem", async ({ problem, period, requests, reason }) => {
+    const live = run(12);
+    for (const next of [1, 2]) {
+      live.begin(next === period && problem === "unreadable" ? unreadable : CLIP);
+      live.write(12);
+    }
+    live.finish();
+    const host = new Host({ "": live });
+    const file = [...live.files.keys()].find((name) => name.startsWith(`init-000${period}`))!;
+    if (problem === "missing") live.files.delete(file);
+    else if (problem === "another") host.instead.set(`/${file}`, new Uint8Array(live.files.get(file)!.length));
+    // Not all of a period is fetched in advance.
+    const play = opened(host, 0, ADDRESS, true, { budgetBytes: 4000 });
+    await play.settled();
+    play.engine.play();
+    await play.toEnd();
+    const [first, end] = [12 * period, 12 * period + 12];
+    expect(play.errors.length).toBe(1);
+    expect(play.errors[0]).toMatch(new RegExp(`^Frames ${first} to ${end - 1} are lost: `));
+    expect(play.errors[0]).toMatch(reason);
+    expect(play.shown.filter((index) => index >= first && index < end)).toEqual([]);
+    expect(play.shown.at(-1)).toBe(35);
+    expect(host.asked(file)).toBe(requests);
+  });
+
+  test("of a period without a frame: requested once a second", async () => {
+    const live = run(6);
+    live.begin(unreadable);
+    live.write(0);
+    const host = new Host({ "": live });
+    const play = opened(host, 0);
+    play.engine.play();
+    await play.until(() => host.asked("init-0001") > 0, "request");
+    await ticks(play, 300, goingOn(play));
+    expect(host.asked("init-0001")).toBeLessThan(4);
+    expect(play.errors).toEqual([]);
+  });
+
+  test.each(["missing", "unreadable"])(
+    "of a live stream, where later frames have another chance: %s",
+    async (problem) => {
+      const live = run(6);
+      live.begin(problem === "unreadable" ? unreadable : CLIP);
+      live.write(3);
+      const host = new Host({ "": live });
+      const file = live.newest("init-0001");
+      const bytes = live.files.get(file)!;
+      if (problem === "missing") live.files.delete(file);
+      const play = opened(host, 0);
+      play.engine.play();
+      const on = goingOn(play);
+      let count = 0;
+      const grows = () => {
+        if (++count % 300 === 0) live.write(1);
+        return on();
+      };
+      await play.until(() => grows() && play.errors.length > 0, "loss");
+      expect(play.errors[0]).toMatch(/^Frames 6 to \d+ are lost: /);
+      await ticks(play, 1000, grows);
+      expect(play.shown.at(-1)).toBe(5);
+      expect(host.asked(file)).toBeLessThan(10);
+      expect(new Set(play.errors).size).toBe(play.errors.length);
+      if (problem === "unreadable") return;
+      live.files.set(file, bytes);
+      await play.until(() => grows() && play.shown.at(-1)! > 5, "later frames");
+    },
+  );
+});
+
+test("a page that cannot be had costs its frames", async () => {
+  const live = run(90, { pageSegments: 4 }).finish();
+  const host = new Host({ "": live });
+  const gone = [...live.files.keys()].filter((name) => name.startsWith("history-"))[1]!;
+  live.files.delete(gone);
+  const play = opened(host, 0);
+  await play.settled();
+  play.engine.play();
+  await play.toEnd();
+  expect(play.errors).toEqual([
+    `Frames 12 to 23 are lost: ${gone} was not found on the server (404). Check the address.`,
+  ]);
+  expect(host.asked(gone)).toBe(3);
+  expect(play.shown.at(-1)).toBe(89);
+});
+
 test("memory is bounded: packets that are far away are dropped", async () => {
   const live = run(180, { pageSegments: 8 }).finish();
   const play = opened(new Host({ "": live }), 0, ADDRESS, true, { budgetBytes: 20_000 });
@@ -501,16 +598,20 @@ describe("qualities", () => {
     expect(play.errors).toEqual([]);
   });
 
-  test("one that cannot be read is reported once and left out", async () => {
-    const low = run(30).finish();
-    const host = new Host({ low });
+  test.each(["manifest", "init"])("one without its %s is reported once and left out", async (missing) => {
+    const [high, low] = [run(30).finish(), run(30).finish()];
+    for (const name of high.files.keys()) if (name.startsWith(missing)) high.files.delete(name);
+    const host = new Host({ high, low });
     host.instead.set("/qualities.json", listed(ENTRIES));
     const play = opened(host, 0, LIST);
     await play.settled();
     play.engine.chooseQuality(1);
+    await play.until(() => play.notices.length > 0, "notice");
     play.engine.play();
     await play.toEnd();
-    expect(play.notices).toEqual(["high/manifest.json was not found on the server (404). Check the address."]);
+    expect(play.errors).toEqual([]);
+    expect(play.notices.length).toBe(1);
+    expect(play.notices[0]).toMatch(new RegExp(`^\\S*${missing}\\S* was not found on the server \\(404\\)`));
     expect(play.engine.qualities.at).toBe(0);
     expect(play.shown.at(-1)).toBe(29);
   });

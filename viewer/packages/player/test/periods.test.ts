@@ -78,3 +78,17 @@ test.each([true, false])("a damaged init record costs its period (with an index:
   expect(play.errors.length).toBe(1);
   expect(play.errors[0]).toMatch(/^Frames 12 to 17 are lost: /);
 });
+
+test("a damaged packet that begins a period does not cost the groups behind it, whatever was sought before", async () => {
+  const bytes = FILE.bytes.slice();
+  bytes[FILE.packets[EACH]! + 30]! ^= 1;
+  const play = playingFile(new ServedFile(bytes));
+  await play.settled();
+  // Frame 7 is lost; the header of its period is forgotten after three others.
+  for (const index of [7, 13, 19, 25, 10]) {
+    play.engine.seekFrame(index);
+    const shown = index === 7 ? 5 : index;
+    await play.until(() => !play.engine.seeking && play.shown.at(-1) === shown, `frame ${shown}`);
+  }
+  expectClip(play, 10 - EACH);
+});

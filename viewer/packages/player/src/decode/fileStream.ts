@@ -84,14 +84,17 @@ export class FileStream implements Stream {
     const { catalog } = this;
     this.current = catalog.period(index);
     // The next period's init record is fetched in advance.
-    if (catalog.period(Math.min(ahead, catalog.count) - 1) > this.current) this.opened(this.current + 1);
-    return this.opened(this.current);
+    if (catalog.period(Math.min(ahead, catalog.count) - 1) > this.current) {
+      this.opened(catalog.init(this.current + 1).first);
+    }
+    return this.opened(index);
   }
 
-  private opened(period: number): Chapter | undefined {
+  private opened(index: number): Chapter | undefined {
+    const period = this.catalog.period(index);
     if (!period) this.chapters.put(0, this.header);
     const found = this.chapters.get(period);
-    if (!found && !this.catalog.isDamaged(this.catalog.init(period).first)) this.fetch(period);
+    if (!found && !this.catalog.isLost(index)) this.fetch(period);
     return found;
   }
 

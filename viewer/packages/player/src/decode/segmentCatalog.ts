@@ -24,9 +24,10 @@ export class SegmentCatalog extends Catalog {
     return this.manifest?.live === true;
   }
 
-  /** The newest period, whose init record is needed next at the edge. */
-  get newestPeriod(): number | undefined {
-    return this.manifest?.periods.at(-1)?.period;
+  /** The period that begins with the frame after the edge, if the writer has named one. */
+  get nextPeriod(): PeriodEntry | undefined {
+    const newest = this.manifest?.periods.at(-1);
+    return newest && newest.first_frame >= this.count ? newest : undefined;
   }
 
   take(manifest: Manifest): void {
@@ -62,11 +63,12 @@ export class SegmentCatalog extends Catalog {
   /** The period of a frame, if known. */
   period(index: number): PeriodEntry | undefined {
     const number = (this.part(index) ?? this.segment(index)?.segment)?.period;
-    return number === undefined ? undefined : this.periodNumbered(number);
+    return this.manifest?.periods.find(({ period }) => period === number);
   }
 
-  periodNumbered(number: number): PeriodEntry | undefined {
-    return this.manifest?.periods.find(({ period }) => period === number);
+  /** The frame after the last of a period so far. */
+  periodEnd(number: number): number {
+    return this.manifest?.periods.find(({ period }) => period > number)?.first_frame ?? this.count;
   }
 
   place(index: number): Place | undefined {

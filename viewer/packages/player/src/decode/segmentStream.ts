@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A stream in a segments folder: follows its manifest and fetches pages and init records on demand. */
 
-import { StreamReader } from "@structgstream/core";
-import type { Manifest, PageEntry, Quality } from "../source/manifest.js";
+import { ByteQueue, StreamError, StreamReader } from "@structgstream/core";
+import type { Manifest, PageEntry, PeriodEntry, Quality } from "../source/manifest.js";
 import type { ByteClient, ReadingEvents } from "./byteClient.js";
 import type { Place } from "./catalog.js";
 import { PacketLoader } from "./packetLoader.js";
@@ -93,8 +93,8 @@ export class SegmentStream implements Stream {
     const isThere = this.known(index);
     // The next period's init record is fetched in advance.
     if (this.known(last)) this.opened(last);
-    const { newestPeriod } = this.catalog;
-    if (isThere && newestPeriod !== undefined && ahead >= this.catalog.count) this.openedPeriod(newestPeriod);
+    const { nextPeriod } = this.catalog;
+    if (isThere && nextPeriod && ahead >= this.catalog.count) this.openedPeriod(nextPeriod, false);
     return isThere ? this.opened(index) : undefined;
   }
 
@@ -108,23 +108,26 @@ export class SegmentStream implements Stream {
   /** Whether a frame's position is known; requests missing pages. */
   private known(index: number): boolean {
     const page = this.catalog.missingPage(index);
-    if (page) this.fetchPage(page);
+    if (page && !this.catalog.isLost(index)) this.fetchPage(page);
     return page === undefined;
   }
 
   private opened(index: number): Chapter | undefined {
     const entry = this.catalog.period(index);
-    return entry && this.openedPeriod(entry.period);
+    return entry && this.openedPeriod(entry, this.catalog.isLost(index));
   }
 
-  private openedPeriod(period: number): Chapter | undefined {
-    const found = this.chapters.get(period);
-    if (!found) this.fetchInit(period);
+  /** @param lost whether the frame that needs it is lost; one that is written later requests it again */
+  private openedPeriod(entry: PeriodEntry, lost: boolean): Chapter | undefined {
+    const found = this.chapters.get(entry.period);
+    if (!found && !lost) this.fetchInit(entry);
     return found;
   }
 
   private fetchPage(entry: PageEntry): void {
-    this.fetch(entry.file, (events) => {
+    const { first_frame: first, frames } = entry;
+    const lose = (problem: string) => this.lose(first, first + frames, problem);
+    this.fetch(entry.file, lose, (events) => {
       this.client.page(this.url, entry, {
         ...events,
         page: ({ content }) => {
@@ -135,39 +138,59 @@ export class SegmentStream implements Stream {
     });
   }
 
-  private fetchInit(period: number): void {
-    const entry = this.catalog.periodNumbered(period);
-    if (!entry) return;
-    this.fetch(entry.file, (events) => {
-      const reader = new StreamReader(entry.file);
-      const bytes: ReadingEvents["bytes"] = (reply) => {
-        try {
-          reader.push(reply.bytes);
-          if (!reader.header) reader.finish();
-          this.chapters.put(period, reader.header!);
-        } catch (error) {
-          this.events.failed(error instanceof Error ? error.message : String(error));
-        }
+  private fetchInit(entry: PeriodEntry): void {
+    const lose = (problem: string) => this.lose(entry.first_frame, this.catalog.periodEnd(entry.period), problem);
+    this.fetch(entry.file, lose, (events, refuse) => {
+      const queue = new ByteQueue();
+      const own: ReadingEvents = {
+        ...events,
+        bytes: ({ bytes }) => queue.append(bytes),
+        end: (reply) => {
+          const reader = new StreamReader(entry.file);
+          try {
+            reader.push(queue.peek(queue.length));
+            if (!reader.header) reader.finish();
+            this.chapters.put(entry.period, reader.header!);
+          } catch (error) {
+            if (!(error instanceof StreamError)) throw error;
+            return refuse(error.message);
+          }
+          events.end(reply);
+        },
       };
-      this.client.read(0, entry.bytes, false, { ...events, bytes }, { url: this.url, entry, small: true });
+      this.client.read(0, entry.bytes, false, own, { url: this.url, entry, small: true });
     });
   }
 
-  /** Requests a file once, and again some time after a failure. */
-  private fetch(file: string, ask: (events: ReadingEvents) => void): void {
+  /** Requests a file once, and again some time after a failure; loses the frames that need it after the last attempt. */
+  private fetch(
+    file: string,
+    lose: (problem: string) => void,
+    ask: (events: ReadingEvents, refuse: (problem: string) => void) => void,
+  ): void {
     if (this.coming.has(file)) return;
     this.coming.add(file);
     const over = () => {
       this.coming.delete(file);
       this.events.stored();
     };
-    ask({
-      end: over,
-      failed: ({ message, temporary }) => {
-        if (this.attempt(file, temporary) > ATTEMPTS) this.events.failed(message);
-        else setTimeout(over, AGAIN_MILLISECONDS);
-      },
-    });
+    const again = () => setTimeout(over, AGAIN_MILLISECONDS);
+    const refuse = (problem: string) => {
+      lose(problem);
+      again();
+    };
+    const failed: ReadingEvents["failed"] = ({ message, temporary }) => {
+      if (this.attempt(file, temporary) >= ATTEMPTS) refuse(message);
+      else again();
+    };
+    ask({ end: over, failed }, refuse);
+  }
+
+  private lose(first: number, end: number, problem: string): void {
+    let from = Math.max(first, this.catalog.first);
+    // The first frames of a period that goes on may be lost since an earlier attempt.
+    while (from < end && this.catalog.isDamaged(from)) from++;
+    if (from < end) this.events.lost(from, end, problem);
   }
 
   private packetsFailed(problem: string, temporary: boolean, first: number, end: number, file: string): void {

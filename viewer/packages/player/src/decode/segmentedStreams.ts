@@ -123,8 +123,9 @@ export class SegmentedStreams {
         else forwarded.failed(`${name} leads to a list of qualities where a manifest belongs.`);
       },
       lost: (first, end, reason) => {
-        if (isActive()) events.lost(first, end, reason);
-        else stream.catalog.markDamaged(first, end);
+        if (isActive()) return events.lost(first, end, reason);
+        stream.catalog.markDamaged(first, end);
+        if (stream.catalog.shownFor(0) === undefined) forwarded.failed(reason);
       },
       notice: (message) => {
         if (isActive()) events.notice(message);
