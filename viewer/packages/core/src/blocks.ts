@@ -82,7 +82,7 @@ export function fieldsIn(
   const coded = new Map<FieldName, Uint8Array>();
   for (const block of blocksIn(payload, start, where)) {
     if (block.coded !== isCoded(block.name)) {
-      const found = block.coded ? "coded, which its codec does not know" : "as it is, where it should be coded";
+      const found = block.coded ? "coded, where it should be as it is" : "as it is, where it should be coded";
       throw new StreamError(`${where} holds field ${block.name} ${found}.`);
     }
     if (block.coded) coded.set(block.name, payload.subarray(block.data, block.end));

@@ -26,7 +26,7 @@ interface CompactState {
 /**
  * Checks that packets with this header can be decoded.
  *
- * @throws StreamError another codec, dynamic fields that cannot be coded, or no step or reference for one
+ * @throws StreamError dynamic fields that cannot be coded, or no step or reference for one
  */
 export function checkCodec(header: StreamHeader): void {
   const { codec, dynamic, steps, reference } = header;
@@ -34,11 +34,6 @@ export function checkCodec(header: StreamHeader): void {
     if (reference.size)
       throw new StreamError("The init record holds dynamic fields, which codec 'raw' has no use for.");
     return;
-  }
-  if (codec !== "compact") {
-    throw new StreamError(
-      `The stream is coded with '${codec}'; this version knows 'raw' and 'compact'. Use a newer one.`,
-    );
   }
   const beyond = [...dynamic].filter((name) => !CODABLE.has(name));
   if (beyond.length) throw new StreamError(`The compact codec has no coding for ${beyond.join(", ")}.`);

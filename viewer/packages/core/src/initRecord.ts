@@ -27,7 +27,14 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   const end = LENGTH_BYTES + viewOf(payload).getUint32(0, true);
   if (end > payload.length) throw new StreamError("The init record states a longer description than it holds.");
   const description = object(unpackedJson(payload.subarray(LENGTH_BYTES, end)), "the description");
-  const header = headerOf(description, fieldsOf(description, payload, end));
+  const codec = text(description.codec, "codec");
+  // Before its fields, which another codec may store otherwise.
+  if (codec !== "raw" && codec !== "compact") {
+    throw new StreamError(
+      `The stream is coded with '${codec}'; this version knows 'raw' and 'compact'. Use a newer one.`,
+    );
+  }
+  const header = headerOf(description, codec, fieldsOf(description, codec, payload, end));
   if (!isScene(new Set([...header.dynamic, ...header.static.keys()]))) {
     throw new StreamError("The init record does not hold every field that packets leave out, and only those.");
   }
@@ -36,16 +43,16 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   return header;
 }
 
-/** With `compact`, nearly all fields are coded; with another codec none is. */
-function fieldsOf(description: Record<string, unknown>, payload: Uint8Array, start: number): Fields {
-  const isCompact = description.codec === "compact";
+/** With `compact`, nearly all fields are coded; with `raw` none is. */
+function fieldsOf(description: Record<string, unknown>, codec: string, payload: Uint8Array, start: number): Fields {
+  const isCompact = codec === "compact";
   const isCoded = (name: FieldName) => isCompact && !AS_THEY_ARE.has(name);
   const { values, coded } = fieldsIn(payload, start, "The init record", isCoded);
   if (!isCompact) return values;
   return mergedFields(values, decodedFields(coded, stepsOf(description.init_steps, "init_steps")));
 }
 
-function headerOf(description: Record<string, unknown>, fields: Fields): StreamHeader {
+function headerOf(description: Record<string, unknown>, codec: string, fields: Fields): StreamHeader {
   const cameras = list(description.cameras, "cameras").map(cameraOf);
   if (new Set(cameras.map((camera) => camera.name)).size !== cameras.length) throw wrong("camera names", "used once");
   if (cameras.filter((camera) => !camera.heldOut).length < 2) throw wrong("cameras", "at least two not held out");
@@ -58,7 +65,7 @@ function headerOf(description: Record<string, unknown>, fields: Fields): StreamH
       scale: positive(similarity.scale, "similarity.scale"),
     },
     fps: positive(description.fps, "fps"),
-    codec: text(description.codec, "codec"),
+    codec,
     dynamic,
     static: selected(fields, (name) => !dynamic.has(name)),
     reference: selected(fields, (name) => dynamic.has(name)),
@@ -168,6 +175,11 @@ function stepOf(value: unknown, what: string): number {
 }
 
 function fieldNameOf(value: unknown): FieldName {
-  if (!isFieldName(value)) throw wrong("dynamic", "names of fields that this version knows");
-  return value;
+  const name = text(value, "a field in dynamic");
+  if (!isFieldName(name)) {
+    throw new StreamError(
+      `The init record lists field '${name}' in dynamic, which this version does not know; use a newer one.`,
+    );
+  }
+  return name;
 }

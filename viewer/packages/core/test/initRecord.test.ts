@@ -70,7 +70,8 @@ test.each<[string, (d: Description) => void]>([
   ["config must be an object", (d) => Object.assign(d, { config: [] })],
   ["metadata must be an object", (d) => Object.assign(d, { metadata: null })],
   ["distance_input must be true or false", (d) => Object.assign(d, { distance_input: 1 })],
-  ["names of fields that this version knows", (d) => d.dynamic.push("hair")],
+  ["lists field 'hair' in dynamic, which this version does not know", (d) => d.dynamic.push("hair")],
+  ["a field in dynamic must be a text", (d) => d.dynamic.push(3)],
   ["does not hold every field that packets leave out", (d) => d.dynamic.pop()],
   ["dynamic fields, which codec 'raw' has no use for", (d) => d.dynamic.push("camera_color")],
   [
@@ -92,7 +93,8 @@ test.each<[string, (d: Description) => void]>([
   ["states no step for base_scales in the init record", (d) => delete d.init_steps],
   ["init_steps.color_mlp must be a float32 number", (d) => Object.assign(d.init_steps, { color_mlp: 0.1 })],
   ["init_steps must be an object", (d) => Object.assign(d, { init_steps: [] })],
-  ["holds field base_scales coded, which its codec does not know", (d) => Object.assign(d, { codec: "raw" })],
+  ["holds field base_scales coded, where it should be as it is", (d) => Object.assign(d, { codec: "raw" })],
+  ["coded with 'later'; this version knows 'raw' and 'compact'", (d) => Object.assign(d, { codec: "later" })],
   ["no coding for camera_color", (d) => d.dynamic.push("camera_color")],
 ])("a compact header is refused: %s", (message, edit) => {
   expect(compact(edit)).toThrow(message);
