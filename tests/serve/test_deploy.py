@@ -21,6 +21,7 @@ import yaml
 from structgstream.cli.app import TERMINATED
 from structgstream.cli.options import parse_known_options
 from structgstream.cli.reconstruct import Reconstruct
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.serve.access import TokenKeys
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.listening import LOOPBACK_NAMES
@@ -41,9 +42,10 @@ def free_port() -> int:
 
 
 @contextmanager
-def started(command: list[str], port: int, **environment: str) -> Iterator[Served]:
+def started(command: list[str], port: int, folder: Path, **environment: str) -> Iterator[Served]:
     """A proxy in a process of its own, which listens on a port of the loopback address."""
-    process = subprocess.Popen(command, env={**os.environ, **environment}, stderr=subprocess.DEVNULL)
+    with (folder / "stderr").open("wb") as stderr:
+        process = subprocess.Popen(command, env={**os.environ, **environment}, stderr=stderr)
     try:
         last = time.monotonic() + PATIENCE_SECONDS
         while True:
@@ -80,7 +82,7 @@ def nginx(folder: Path, upstream: int) -> Iterator[Served]:
     )
     whole = f"{user} daemon off; pid {folder}/pid; events {{}} http {{ {places}\n{site} }}"
     (folder / "nginx.conf").write_text(whole)
-    with started(["nginx", "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors")], port) as running:
+    with started(["nginx", "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors")], port, folder) as running:
         yield running
 
 
@@ -91,11 +93,12 @@ def caddy(folder: Path, upstream: int) -> Iterator[Served]:
     text = (DEPLOY / "Caddyfile").read_text()
     assert text.count(f"{NAME} {{") == 1
     text = text.replace(f"{NAME} {{", f"http://{NAME} {{\n\tbind 127.0.0.1")
-    text = text.replace("\tlog {", f"\tlog {{\n\t\toutput file {folder}/structgstream.log", 1)
-    (folder / "Caddyfile").write_text(f"{{\n\tadmin off\n\thttp_port {port}\n}}\n{text}")
+    assert text.count("\tlog {") == 1
+    here = f"\tadmin off\n\thttp_port {port}\n\tlog {{\n\t\toutput file {folder}/structgstream.log"
+    (folder / "Caddyfile").write_text(text.replace("\tlog {", here))
     command = ["caddy", "run", "--config", str(folder / "Caddyfile"), "--adapter", "caddyfile"]
     places = {"XDG_DATA_HOME": str(folder), "XDG_CONFIG_HOME": str(folder), "UPSTREAM": f"127.0.0.1:{upstream}"}
-    with started(command, port, **places) as running:
+    with started(command, port, folder, **places) as running:
         yield running
 
 
@@ -122,6 +125,8 @@ def test_a_live_stream_behind_a_proxy(tmp_path: Path, proxy: str) -> None:
     for _ in range(5):
         growing.write()
     assert growing.manifest is not None
+    low = GrowingFolder(tmp_path / "streams" / "show" / "low", STREAM)
+    write_list(tmp_path / "streams" / "show", [ListedQuality("low", "low/manifest.json", 1e6)])
     places = tmp_path / "proxy"
     places.mkdir()
     with behind(proxy, tmp_path / "streams", places) as (server, front):
@@ -146,6 +151,14 @@ def test_a_live_stream_behind_a_proxy(tmp_path: Path, proxy: str) -> None:
         assert "immutable" in ask(address).headers["cache-control"]
         if proxy == "nginx":
             assert ask(address).headers["x-cache"] == "HIT"
+        # So it is with the files of a quality.
+        part = f"/streams/show/low/{low.write().parts[0].file}"
+        last = time.monotonic() + PATIENCE_SECONDS
+        while ask(part).status == 404:
+            assert time.monotonic() < last
+            time.sleep(0.1)
+        if proxy == "nginx":
+            assert ask(part).headers["x-cache"] == "HIT"
         # Waiting goes through the proxy.
         with ThreadPoolExecutor(1) as pool:
             waiting = pool.submit(ask, "/streams/studio/manifest.json?after=5")
@@ -185,6 +198,7 @@ def test_tokens_do_not_reach_the_log(tmp_path: Path, proxy: str) -> None:
         for _ in range(2):
             answer = front.ask(f"/streams/studio/manifest.json?token={token}", Host=NAME)
             assert answer.status == 200
+        assert front.ask(f"/streams/studio?token={token}", Host=NAME).status == 307
         file = next((tmp_path / "streams" / "studio").glob("segment-*")).name
         assert front.ask(f"/streams/studio/{file}?token={token}", Host=NAME).status == 200
         # What one was shown is not shown to another.
@@ -194,6 +208,15 @@ def test_tokens_do_not_reach_the_log(tmp_path: Path, proxy: str) -> None:
     log = (tmp_path / "structgstream.log").read_text()
     assert "manifest.json" in log
     assert token.split(".")[2] not in log
+
+
+def test_tokens_do_not_reach_the_log_of_a_server_that_is_down(tmp_path: Path, proxy: str) -> None:
+    with PROXIES[proxy](tmp_path, free_port()) as front:
+        address = "/streams/studio/manifest.json?token=abcdefgh"
+        assert front.ask(address, Host=NAME, Authorization="Bearer abcdefgh").status == 502
+    logs = b"".join(path.read_bytes() for path in tmp_path.iterdir() if path.is_file())
+    assert b"manifest.json" in logs
+    assert b"abcdefgh" not in logs
 
 
 def test_the_compose_file_and_the_image() -> None:
