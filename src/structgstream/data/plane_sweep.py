@@ -151,15 +151,15 @@ def consistent_pixels(
     total = points.copy()
     agreeing, looking = np.zeros(len(points), np.intp), np.zeros(len(points), np.intp)
     for other in others:
-        seen, estimate = _agreement(points, depth_map, pixels, other, config)
-        agreeing[seen] += 1
-        total[seen] += estimate
-        looking += inside(other.camera, *project(other.camera, points), near=0.0)
+        seen, confirmed, estimate = _agreement(points, depth_map, pixels, other, config)
+        agreeing[confirmed] += 1
+        total[confirmed] += estimate
+        looking[seen] += 1
     # At the edge of the common volume, where only one other camera sees the point, that one suffices.
-    confirmed = agreeing >= np.clip(looking, 1, config.views)
+    enough = agreeing >= np.clip(looking, 1, config.views)
     mask = np.zeros(depth_map.believed.shape, bool)
-    mask[row[confirmed], column[confirmed]] = True
-    return total[confirmed] / (agreeing[confirmed, None] + 1), mask
+    mask[row[enough], column[enough]] = True
+    return total[enough] / (agreeing[enough, None] + 1), mask
 
 
 def sweep_points(
@@ -214,8 +214,8 @@ def sweep_points(
 
 def _agreement(
     points: Floats, own: DepthMap, pixels: Floats, other: DepthMap, config: SweepConfig
-) -> tuple[Indices, Floats]:
-    """Indices of the ``points`` that the other map confirms, and its estimates of them."""
+) -> tuple[Indices, Indices, Floats]:
+    """Indices of the ``points`` in the other picture, of those that its map confirms, and its estimates of these."""
     projected, depths = project(other.camera, points)
     seen = np.flatnonzero(inside(other.camera, projected, depths, near=0.0))
     column, row = projected[seen].astype(np.intp).T
@@ -223,12 +223,12 @@ def _agreement(
     planes, share = config.agreement
     tolerance = np.maximum(planes * other.step, share * inverse)
     close = other.believed[row, column] & (np.abs(inverse - 1 / depths[seen]) < tolerance)
-    seen, inverse = seen[close], inverse[close]
+    confirmed = seen[close]
     # The other view's depth along the ray through this very point, so that no pixel grid shows in the mean.
-    estimate = back_project(other.camera, projected[seen], 1 / inverse)
+    estimate = back_project(other.camera, projected[confirmed], 1 / inverse[close])
     returned, _ = project(own.camera, estimate)
-    near_pixel = np.linalg.norm(returned - pixels[seen], axis=1) < 1.5
-    return seen[near_pixel], estimate[near_pixel]
+    near_pixel = np.linalg.norm(returned - pixels[confirmed], axis=1) < 1.5
+    return seen, confirmed[near_pixel], estimate[near_pixel]
 
 
 @dataclass(frozen=True)
