@@ -43,8 +43,8 @@ MEASURED = (
 """Spacing in degrees, and PSNR in dB of frame 0 at cameras that were held out, of two captures with 4 to 27 cameras
 (lab/notes/scaling.md, Few cameras far apart). At 54 degrees it is the mean of three seeds, which differ by 5 dB."""
 SPREAD = 1.15
-"""Factor by which the spacing between two cameras may differ from that of the rig: two sets of 8 cameras of one dome, 48
-and 54 degrees apart, gave 21.9 and, over three seeds, 19 to 24 dB."""
+"""Factor by which cameras may be farther apart, or closer, than their spacing says: two sets of 8 cameras of one dome,
+48 and 54 degrees apart, gave 21.9 and, over three seeds, 19 to 24 dB."""
 GOOD_DEGREES = 20.0
 """What docs/film-it.md asks for: nothing is said of cameras that are closer."""
 WARNING_PSNR = 25.0
