@@ -27,7 +27,7 @@ struct Pinhole {
 
 // alpha = 2^(log2_opacity - (xx dx^2 + xy dx dy + yy dy^2)), the conic scaled by log2(e) / 2 (xy by log2(e)).
 struct alignas(64) Splat {
-    Splat() {}                 // not set to zero: every splat is written before it is read
+    Splat() {}                 // not set to zero: of one that is not drawn only the box is written, and only that counts
     float x, y;
     float xx, xy, yy;
     float log2_opacity;
