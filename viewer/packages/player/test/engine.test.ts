@@ -222,6 +222,17 @@ test("a starved clock waits with the last frame, and says so", async () => {
   expect(play.shown.at(-1)).toBe(11);
 });
 
+test.each([true, false])("a server may send less than was asked for, of a file with an index: %s", async (indexed) => {
+  const file = new ServedFile(indexed ? CLIP : CLIP.slice(0, -1));
+  file.mostBytes = 1500;
+  file.lastModified = new Date(0).toUTCString();
+  const play = playingFile(file);
+  await play.settled();
+  await play.until(() => play.engine.frames.count === PACKETS.length);
+  await play.seeksExactly(11);
+  expect(play.errors).toEqual([]);
+});
+
 describe("a server without ranges", () => {
   test("is read whole, once, and said so", async () => {
     const file = new ServedFile(CLIP);

@@ -34,6 +34,8 @@ export class ServedFile {
   failures = 0;
   lastModified = new Date().toUTCString();
   chunkBytes = 5000;
+  /** Most bytes of an answer to a request for a range. */
+  mostBytes = Number.POSITIVE_INFINITY;
   /** Bytes from this one on do not arrive until it is raised. */
   heldFrom = Number.POSITIVE_INFINITY;
 
@@ -55,7 +57,7 @@ export class ServedFile {
       return new Response(this.body(0, size), { headers: { ...headers, "Content-Length": `${size}` } });
     }
     const start = Number(range[1]);
-    const end = range[2] ? Math.min(Number(range[2]) + 1, size) : size;
+    const end = Math.min(range[2] ? Number(range[2]) + 1 : size, size, start + this.mostBytes);
     this.requests.push([start, end]);
     if (start >= size) {
       return new Response("", { status: 416, headers: { ...headers, "Content-Range": `bytes */${size}` } });

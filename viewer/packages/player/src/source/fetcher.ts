@@ -140,7 +140,10 @@ export class Fetcher {
     return new BlobSource(blob, source.name);
   }
 
-  /** Reads a range, with retries from where it broke off; returns the offset of the end. */
+  /**
+   * Reads a range, with retries from where it broke off; returns the offset of the end. A server may answer with less than
+   * was asked for, and a connection may end early without an error, so the rest is asked for until it has come.
+   */
   private async read(
     source: ByteSource,
     id: number,
@@ -155,12 +158,15 @@ export class Fetcher {
     for (let attempt = 0; ; ) {
       try {
         const options = { end, wholeIfNeeded: wholeIfNeeded === true && !begun };
+        let known = 0;
+        let came = false;
         await source.read(
           at,
           options,
           {
             begin: ({ start: from, fileBytes, ranged }) => {
               at = from;
+              known = fileBytes ?? 0;
               if (!begun && !signal.aborted) this.port.postMessage({ type: "begin", id, fileBytes, ranged }, []);
               begun = true;
               this.answered = true;
@@ -168,12 +174,14 @@ export class Fetcher {
             take: (bytes) => {
               at += bytes.length;
               attempt = 0;
+              came = true;
               give(bytes);
             },
           },
           signal,
         );
-        return at;
+        if (signal.aborted || at >= Math.min(end ?? known, known)) return at;
+        if (!came) throw new SourceError("The server sends less than it announces.", true);
       } catch (error) {
         const wait = this.retryPolicy.retries[attempt++];
         const hopeless = !(error instanceof SourceError && error.temporary) || wait === undefined;
