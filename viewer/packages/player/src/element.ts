@@ -54,6 +54,8 @@ export class StructgstreamPlayer extends HTMLElement {
   private silenced: boolean | undefined;
   private loudness = 1;
   private session: XrSession | undefined;
+  /** Pixels of the screen in one of the page when the picture got its size; the page's zoom changes it. */
+  private pixelRatio = 0;
 
   connectedCallback(): void {
     this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
@@ -478,6 +480,7 @@ export class StructgstreamPlayer extends HTMLElement {
 
   private readonly tick = (): void => {
     this.ticking = requestAnimationFrame(this.tick);
+    if (this.pixelRatio !== devicePixelRatio) this.resized();
     this.running?.player.tick();
     this.running?.ui.tick();
   };
@@ -553,6 +556,7 @@ export class StructgstreamPlayer extends HTMLElement {
 
   private resized(): void {
     if (!this.running) return;
+    this.pixelRatio = devicePixelRatio;
     const { width, height } = this.getBoundingClientRect();
     this.running.player.resize(width * devicePixelRatio, height * devicePixelRatio);
     this.running.ui.resize(width);

@@ -33,6 +33,20 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     expect(await size()).toEqual([180, 300]);
   });
 
+  test("follows the zoom of the page, which does not change the element's size", async () => {
+    const page = await stage.open();
+    await shows(page, 0);
+    const session = await page.context().newCDPSession(page);
+    const canvas = () => ask(page, (player) => player.shadowRoot!.querySelector("canvas")!.width);
+    for (const deviceScaleFactor of [2, 1]) {
+      const size = { width: 320, height: 240, mobile: false };
+      await session.send("Emulation.setDeviceMetricsOverride", { ...size, deviceScaleFactor });
+      await expect.poll(canvas).toBe(320 * deviceScaleFactor);
+    }
+    await session.send("Emulation.clearDeviceMetricsOverride");
+    await session.detach();
+  });
+
   test("keyboard, mouse and wheel", async () => {
     const page = await stage.open();
     await shows(page, 0);
