@@ -31,6 +31,7 @@ canvas { display: block; }
 .frustum text { fill: #fff; font-size: 11px; text-anchor: middle; paint-order: stroke; stroke: rgb(0 0 0 / 65%); stroke-width: 3px; }
 .glass { background: var(--panel); border: 1px solid var(--line); border-radius: 10px; backdrop-filter: blur(14px);
   -webkit-backdrop-filter: blur(14px); }
+.bar, .panel, .note, .middle { direction: ltr; }
 .bar { position: absolute; left: 10px; right: 10px; bottom: 10px; padding: 2px 6px 4px; transition: opacity .2s; }
 .row { display: flex; align-items: center; gap: 2px; min-width: 0; }
 .space { flex: 1; min-width: 0; }

@@ -47,6 +47,14 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     await session.detach();
   });
 
+  test("the time is read from left to right in a page that is not", async () => {
+    const page = await stage.open('src="clip.sgs" dir="rtl"');
+    await shows(page, 0);
+    expect(await ask(page, (player) => getComputedStyle(player.shadowRoot!.querySelector(".time")!).direction)).toBe(
+      "ltr",
+    );
+  });
+
   test("keyboard, mouse and wheel", async () => {
     const page = await stage.open();
     await shows(page, 0);
