@@ -48,10 +48,11 @@ export class PlayerUi {
   private readonly statistics: Statistics;
   private readonly gestures: Gestures;
   private readonly keyboard: Keyboard;
+  private readonly stage: HTMLElement;
   private readonly posterImage = made("img", { class: "poster", part: "poster", alt: "", hidden: true });
   private readonly drop = made("div", { class: "drop", hidden: true }, "Drop a stream to play it");
   private opened:
-    | { readonly name: PanelName; readonly root: HTMLElement; readonly button: Element | undefined }
+    | { readonly name: PanelName; readonly root: HTMLElement; readonly button: HTMLElement | undefined }
     | undefined;
   private touring = false;
   private movedAt = 0;
@@ -90,6 +91,7 @@ export class PlayerUi {
       role: "application",
       "aria-label": label,
     });
+    this.stage = stage;
     canvas.setAttribute("part", "picture");
     stage.append(canvas, this.posterImage, this.overlay.root, this.compare.root);
     this.gestures = new Gestures(stage, player, () => this.tapped());
@@ -329,9 +331,16 @@ export class PlayerUi {
   }
 
   private closePanel(): void {
-    this.opened?.button?.setAttribute("aria-expanded", "false");
-    this.opened?.root.remove();
+    const { opened, stage } = this;
+    if (!opened) return;
     this.opened = undefined;
+    const focused = opened.root.matches(":focus-within");
+    opened.button?.setAttribute("aria-expanded", "false");
+    opened.root.remove();
+    if (!focused) return;
+    // Where the focus goes with its element, keys do nothing any more. A small player may hide the button.
+    stage.focus();
+    opened.button?.focus();
   }
 
   private chooseFile(): void {

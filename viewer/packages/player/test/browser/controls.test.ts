@@ -55,6 +55,20 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     );
   });
 
+  test("who closes a panel goes on where it was opened", async () => {
+    const page = await stage.open();
+    await shows(page, 0);
+    const focused = () => ask(page, (player) => (player.shadowRoot!.activeElement as HTMLElement | null)?.title);
+    await page.getByRole("button", { name: "Cameras" }).press("Enter");
+    await page.getByRole("button", { name: "Close" }).press("Enter");
+    expect(await focused()).toBe("Cameras");
+    await page.locator(".stage").press("?");
+    await page.getByRole("button", { name: "Close" }).press("Enter");
+    expect(await ask(page, (player) => player.shadowRoot!.activeElement?.className)).toBe("stage");
+    await page.keyboard.press("End");
+    await shows(page, LAST);
+  });
+
   test("keyboard, mouse and wheel", async () => {
     const page = await stage.open();
     await shows(page, 0);
