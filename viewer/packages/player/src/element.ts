@@ -7,7 +7,7 @@
 
 import { SOUND_RATE } from "@structgstream/core";
 import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
-import type { Engine } from "./engine/engine.js";
+import { allowedRate, type Engine } from "./engine/engine.js";
 import { type MediaEvents, MediaState, Ranges } from "./mediaEvents.js";
 import { startedPipeline } from "./pipeline.js";
 import { Player, type PlayerEvents } from "./player.js";
@@ -25,6 +25,7 @@ import { offersXr, XR_MODES, type XrMode, XrSession } from "./xr/session.js";
 const MEDIA_ERR_SRC_NOT_SUPPORTED = 4;
 /** In a page that is hidden the player goes on at this interval. */
 const HIDDEN_MILLISECONDS = 500;
+const NOTHING_WANTED = { playing: false, seconds: undefined };
 
 interface Running {
   readonly player: Player;
@@ -53,9 +54,26 @@ export class StructgstreamPlayer extends HTMLElement {
   /** Whether it is muted; undefined: as the attribute says. */
   private silenced: boolean | undefined;
   private loudness = 1;
+  private speed = 1;
+  /** What was asked for before a stream was opened: to play, and from where. */
+  private wanted: { readonly playing: boolean; readonly seconds: number | undefined } = NOTHING_WANTED;
   private session: XrSession | undefined;
   /** Pixels of the screen in one of the page when the picture got its size; the page's zoom changes it. */
   private pixelRatio = 0;
+
+  constructor() {
+    super();
+    // What a page has set before this module ran hides the property of that name.
+    for (const [name, value] of Object.entries(this)) {
+      if (!Object.getOwnPropertyDescriptor(StructgstreamPlayer.prototype, name)?.set) continue;
+      Reflect.deleteProperty(this, name);
+      try {
+        Reflect.set(this, name, value);
+      } catch (error) {
+        reportError(error);
+      }
+    }
+  }
 
   connectedCallback(): void {
     this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
@@ -87,9 +105,10 @@ export class StructgstreamPlayer extends HTMLElement {
 
   /** Plays; resolves when frames follow each other, and rejects as a video does if it is paused before or fails. */
   play(): Promise<void> {
-    this.engine?.play();
     const { engine } = this;
-    if (engine && !engine.paused && !engine.seeking && !engine.stalled) return Promise.resolve();
+    engine?.play();
+    if (!engine) this.wanted = { ...this.wanted, playing: true };
+    if (this.running?.media.running) return Promise.resolve();
     const started = new Promise<void>((resolve, reject) => {
       const waiting = new AbortController();
       const once = (name: string, settle: () => void) => {
@@ -103,7 +122,7 @@ export class StructgstreamPlayer extends HTMLElement {
         reject(new DOMException(this.error?.message ?? "Paused before it played.", "AbortError"));
       once("playing", resolve);
       once("pause", interrupted);
-      once("loadstart", interrupted);
+      if (engine) once("loadstart", interrupted);
     });
     started.catch(() => undefined); // who does not wait for it hears of an error by its event
     return started;
@@ -111,10 +130,12 @@ export class StructgstreamPlayer extends HTMLElement {
 
   pause(): void {
     this.engine?.pause();
+    this.wanted = { ...this.wanted, playing: false };
   }
 
   seek(seconds: number): void {
-    this.engine?.seek(seconds);
+    if (this.engine) this.engine.seek(seconds);
+    else this.wanted = { ...this.wanted, seconds };
   }
 
   /** Pauses and steps forward or back by a number of frames. */
@@ -123,10 +144,12 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   get playbackRate(): number {
-    return this.running?.player.playbackRate ?? 1;
+    return this.running?.player.playbackRate ?? this.speed;
   }
 
+  /** @throws RangeError it is not positive */
   set playbackRate(rate: number) {
+    this.speed = allowedRate(rate);
     if (this.running) this.running.player.playbackRate = rate;
   }
 
@@ -203,7 +226,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   get paused(): boolean {
-    return this.engine?.paused ?? true;
+    return this.engine?.paused ?? !this.wanted.playing;
   }
 
   get ended(): boolean {
@@ -388,6 +411,7 @@ export class StructgstreamPlayer extends HTMLElement {
     }
     player.sound.muted = this.silenced ?? this.defaultMuted;
     player.sound.volume = this.loudness;
+    player.playbackRate = this.speed;
     const ui = new PlayerUi({
       host: this,
       canvas,
@@ -442,6 +466,7 @@ export class StructgstreamPlayer extends HTMLElement {
     navigator.xr?.removeEventListener("devicechange", this.offerXr);
     void this.exitXr();
     const { running } = this;
+    this.speed = this.playbackRate;
     this.running = undefined;
     running?.observer.disconnect();
     running?.player.destroy();
@@ -540,10 +565,11 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   private open(source: SourceDescription, seconds?: number): void {
-    const { running, link } = this;
+    const { running, link, wanted } = this;
     if (!running) return;
     const { player, ui, media } = running;
-    const at = seconds ?? link?.seconds;
+    const at = seconds ?? wanted.seconds ?? link?.seconds;
+    this.wanted = NOTHING_WANTED;
     const view = link?.view;
     this.link = undefined; // a link applies only to the first stream
     this.linked = this.linkable(source);
@@ -551,7 +577,7 @@ export class StructgstreamPlayer extends HTMLElement {
     media.begin();
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
     ui.begin(source.name);
-    if (this.hasAttribute("autoplay")) engine.play();
+    if (wanted.playing || this.hasAttribute("autoplay")) engine.play();
   }
 
   private resized(): void {

@@ -44,7 +44,8 @@ export class MediaState {
   private drawn = false;
   private paused = true;
   private seeking = false;
-  private running = false;
+  /** Whether frames follow each other. */
+  running = false;
   private stalled = false;
   private rate = 1;
   private muted: boolean;
@@ -90,6 +91,7 @@ export class MediaState {
       this.drawn = true;
       this.emit("loadeddata");
       this.emit("canplay");
+      this.compare();
     } else if (name === "error") {
       const { message, fatal } = detail as { readonly message: string; readonly fatal: boolean };
       if (fatal) this.error = message;
@@ -127,7 +129,7 @@ export class MediaState {
     this.rate = playbackRate;
     this.paused = engine?.paused ?? true;
     this.seeking = engine?.seeking ?? false;
-    this.running = !this.paused && !this.seeking && !this.stalled;
+    this.running = this.drawn && !this.paused && !this.seeking && !this.stalled;
     if (rate !== this.rate) this.emit("ratechange");
     if (paused && !this.paused) this.emit("play");
     // The first frame of a stream is sought, too; to a page that is loading it.

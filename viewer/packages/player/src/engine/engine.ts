@@ -20,6 +20,18 @@ import { Timeline } from "./timeline.js";
 
 const RATES: readonly [number, number] = [0.05, 16];
 
+/**
+ * The nearest rate that can be played.
+ *
+ * @throws RangeError it is not positive
+ */
+export function allowedRate(rate: number): number {
+  if (!Number.isFinite(rate) || rate <= 0) {
+    throw new RangeError(`The playback rate is ${rate}; expected a positive number, such as 0.5.`);
+  }
+  return Math.min(Math.max(rate, RATES[0]), RATES[1]);
+}
+
 export class Engine extends Emitter<EngineEvents> {
   loop = false;
   header: StreamHeader | undefined;
@@ -137,10 +149,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   set playbackRate(rate: number) {
-    if (!Number.isFinite(rate) || rate <= 0) {
-      throw new RangeError(`The playback rate is ${rate}; expected a positive number, such as 0.5.`);
-    }
-    this.rate = Math.min(Math.max(rate, RATES[0]), RATES[1]);
+    this.rate = allowedRate(rate);
     this.clock.setRate(this.rate, this.now());
     this.emit("state", {});
   }

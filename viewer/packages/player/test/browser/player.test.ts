@@ -4,6 +4,7 @@
 import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
 import { TestServer } from "../../../gl/test/support/server.ts";
+import type { StructgstreamPlayer } from "../../src/element.ts";
 import { CLIP } from "../served.ts";
 import { ask, ended, pageWith, reported, StagedTests, shows } from "./stage.ts";
 
@@ -86,6 +87,38 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     expect(await ask(page, (player) => getComputedStyle(player.shadowRoot!.querySelector(".bar")!).opacity)).toBe(
       "0.5",
     );
+  });
+
+  test("what a page asks for before the module runs, or before the element is in the page, holds", async () => {
+    const page = await stage.open("");
+    const asked = () => {
+      const player = document.querySelector("structgstream-player") ?? document.createElement("structgstream-player");
+      Object.assign(player, { src: "clip.sgs", muted: true, playbackRate: 0.5, loop: true, volume: 0.3 });
+      Object.assign(player, { currentTime: 0.2 });
+      return player;
+    };
+    const early = pageWith("").replace("<script>", `<script>(${asked})();`);
+    stage.server.put("/page.html", early, { type: "text/html" });
+    await page.reload();
+    await shows(page, 6);
+    const held = () => ask(page, (one) => [one.src, one.muted, one.playbackRate, one.loop, one.volume, one.paused]);
+    expect(await held()).toEqual(["clip.sgs", true, 0.5, true, 0.3, true]);
+    await page.evaluate(async (text) => {
+      document.querySelector("structgstream-player")!.remove();
+      const player = new Function(`return (${text})()`)() as StructgstreamPlayer;
+      const playing = player.play();
+      document.body.append(player);
+      await playing;
+    }, String(asked));
+    expect(await held()).toEqual(["clip.sgs", true, 0.5, true, 0.3, false]);
+    expect(await ask(page, (player) => player.currentTime)).toBeGreaterThanOrEqual(0.2);
+    await page.evaluate(() => {
+      const player = document.querySelector("structgstream-player")!;
+      player.remove();
+      return Promise.resolve().then(() => document.body.append(player));
+    });
+    await ask(page, (player) => player.play());
+    expect(await held()).toEqual(["clip.sgs", true, 0.5, true, 0.3, false]);
   });
 
   test("follows a growing file and says when the next frame may come", async () => {
