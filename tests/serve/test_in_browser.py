@@ -162,6 +162,15 @@ def test_a_site_plays_from_a_server_that_knows_nothing(tab: Tab, stream: Path, t
     assert not tab.complaints
 
 
+def test_a_site_that_is_opened_from_the_disk_says_what_it_needs(tab: Tab, stream: Path, tmp_path: Path) -> None:
+    write_site(tmp_path / "site", StreamFile(stream))
+    tab.open((tmp_path / "site" / "index.html").as_uri(), width=WIDTH, height=HEIGHT)
+    style = f"getComputedStyle({PLAYER}, '::before')"
+    tab.wait_for(f"{PLAYER} && {style}.visibility === 'visible'")
+    assert "put its folder on a web server" in tab.evaluate(f"{style}.content")
+    tab.complaints.clear()
+
+
 @contextmanager
 def python_host(root: Path) -> Iterator[str]:
     """The standard library's server of files."""

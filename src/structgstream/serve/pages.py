@@ -51,6 +51,13 @@ html,body{margin:0;height:100%;color-scheme:light dark}
 structgstream-player{width:100%;height:100%}
 </style>
 """
+_NOT_LOADED_STYLE: Final = """<style>
+structgstream-player:not(:defined)::before{content:"The player is not loaded yet. If this stays: from a disk this page cannot \
+load it; put its folder on a web server, or make a single page with structgstream export -o page.html.";\
+display:block;padding:2rem;font:16px/1.5 system-ui,sans-serif;animation:late 3s}
+@keyframes late{0%,99%{visibility:hidden}}
+</style>
+"""
 _LIST_STYLE: Final = """<style>
 :root{color-scheme:light dark;font:16px/1.5 system-ui,sans-serif}
 body{margin:0 auto;max-width:72rem;padding:1.5rem}
@@ -95,7 +102,7 @@ def linked_page(
 ) -> str:
     """A page that loads the player and the stream, both by addresses relative to the page, for a server; the element
     gets further ``attributes``."""
-    script = f'<script type="module" src="{html.escape(module)}"></script>'
+    script = f'{_NOT_LOADED_STYLE}<script type="module" src="{html.escape(module)}"></script>'
     body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
     return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
 
