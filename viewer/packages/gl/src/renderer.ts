@@ -30,6 +30,12 @@ interface Shown {
   readonly look: Look;
 }
 
+/** A browser that restores a context does so sooner. */
+const LOST_MILLISECONDS = 3000;
+const LOST =
+  "The browser has taken the graphics memory of this picture, as it does from the oldest of more than about 16 in a " +
+  "page; it is drawn again when the browser gives it back. Remove other players, or reload the page.";
+
 /** After a lost context, `render` works again once the canvas has had its event `webglcontextrestored`. */
 export class SplatRenderer {
   /** The next `render` can draw something new: an order has come, or the GPU is free again. */
@@ -51,6 +57,7 @@ export class SplatRenderer {
   private shown: Shown | undefined;
   private settling: { resolve: () => void; reject: (error: Error) => void }[] = [];
   private destroyed = false;
+  private lostFor: ReturnType<typeof setTimeout> | undefined;
 
   /** @throws GlError there is no WebGL2, or the device does not support the requested path */
   constructor(
@@ -154,6 +161,7 @@ export class SplatRenderer {
     this.destroyed = true;
     this.canvas.removeEventListener("webglcontextlost", this.lost);
     this.canvas.removeEventListener("webglcontextrestored", this.restored);
+    clearTimeout(this.lostFor);
     this.orders.close();
     this.pace.stop();
     this.pipeline?.delete();
@@ -264,9 +272,11 @@ export class SplatRenderer {
     this.pace.stop();
     this.pipeline = undefined;
     this.shown = undefined;
+    this.lostFor = setTimeout(() => this.onError?.(new GlError(LOST)), LOST_MILLISECONDS);
   };
 
   private readonly restored = (): void => {
+    clearTimeout(this.lostFor);
     try {
       this.device = deviceOf(this.device.gl);
       this.pipeline = this.newPipeline();
