@@ -20,7 +20,8 @@ export function startedPipeline(): Pipeline {
   decoder.onmessage = ({ data }: MessageEvent<FromDecoder>) => pipeline.onmessage?.(data);
   for (const worker of workers) {
     worker.onerror = (event) => {
-      const message = `A worker of the player stopped: ${event.message ?? "it cannot be started from this page"}.`;
+      const unknown = "this page cannot start it (does its Content-Security-Policy allow worker-src blob:?)";
+      const message = `A worker of the player stopped: ${event.message ?? unknown}.`;
       pipeline.onmessage?.({ type: "failed", message, fatal: true });
     };
   }
