@@ -52,8 +52,8 @@ structgstream-player{width:100%;height:100%}
 </style>
 """
 _NOT_LOADED_STYLE: Final = """<style>
-structgstream-player:not(:defined)::before{content:"The player is not loaded yet. If this stays: from a disk this page cannot \
-load it; put its folder on a web server, or make a single page with structgstream export -o page.html.";\
+structgstream-player:not(:defined)::before{content:"The player is not loaded yet. If this stays: from a disk this page \
+cannot load it; put its folder on a web server, or make a single page with structgstream export -o page.html.";\
 display:block;padding:2rem;font:16px/1.5 system-ui,sans-serif;animation:late 3s}
 @keyframes late{0%,99%{visibility:hidden}}
 </style>
