@@ -15,8 +15,8 @@ from structgstream.exporters.ply import find_sequence, ply_bytes, read_ply
 from tests.support.plain import some
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_another_library_s_file(degree: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("degree", "newline"), [(0, b"\n"), (3, b"\r\n")])
+def test_another_library_s_file(degree: int, newline: bytes, tmp_path: Path) -> None:
     """Properties in another order and of other types, one more of them, and a second element."""
     wanted = some(20, degree=degree)
     (tmp_path / "ours.ply").write_bytes(ply_bytes(wanted, FrameOptions()))
@@ -27,6 +27,8 @@ def test_another_library_s_file(degree: int, tmp_path: Path) -> None:
         rows[name] = ours[name]
     other = PlyElement.describe(np.zeros(2, [("x", "f4")]), "other")
     PlyData([PlyElement.describe(rows, "vertex"), other], byte_order="<").write(str(tmp_path / "theirs.ply"))
+    head, end, body = (tmp_path / "theirs.ply").read_bytes().partition(b"end_header\n")
+    (tmp_path / "theirs.ply").write_bytes((head + end).replace(b"\n", newline) + body)
     found = read_ply(tmp_path / "theirs.ply")
     for name in ("means", "quats", "scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-6)
@@ -34,7 +36,8 @@ def test_another_library_s_file(degree: int, tmp_path: Path) -> None:
 
 def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for number in (0, 5, 10, 100, 15, *range(20, 100, 5)):
-        (tmp_path / f"point_cloud_{number}.ply").touch()
+        (tmp_path / f"point_cloud_{number}.{'PLY' if number == 5 else 'ply'}").touch()
+        (tmp_path / f"._point_cloud_{number}.ply").touch()
     assert [file.stem for file in find_sequence(tmp_path)] == [f"point_cloud_{n}" for n in range(0, 101, 5)]
 
 
@@ -69,8 +72,15 @@ GOOD = ply_bytes(some(5, degree=1), FrameOptions())
         (GOOD.replace(b"f_rest_8\n", b"f_more_8\n"), "has 8 properties f_rest|lacks the property f_rest"),
         (GOOD.replace(b"float x\n", b"quad x\n"), "of unknown types"),
         (GOOD[:-100], "ends after 4 of 5 Gaussians"),
+        (GOOD.replace(b"vertex 5", b"vertex 5" + b"0" * 15), "ends after 5 of 5000000000000000 Gaussians"),
+        (GOOD.replace(b"vertex 5", b"vertex"), "does not begin with an element vertex"),
+        (GOOD.replace(b"float nx\n", b"float x\n"), "two properties of one name"),
         (
             ply_bytes(replace(some(5), means=torch.full((5, 3), torch.inf)), FrameOptions()),
+            "5 of 5 Gaussians of .* finite",
+        ),
+        (
+            ply_bytes(replace(some(5), quats=torch.full((5, 4), torch.nan)), FrameOptions()),
             "5 of 5 Gaussians of .* finite",
         ),
     ],

@@ -79,7 +79,9 @@ class PlyHeader:
 def find_sequence(folder: Path) -> list[Path]:
     """The ``.ply`` files of ``folder`` in the order of the last number of their names. Raises CaptureError if there are
     none, names have several prefixes or no number, or numbers are missing."""
-    files = sorted(folder.glob("*.ply")) if folder.is_dir() else []
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    # macOS leaves a hidden ._NAME for each NAME on foreign file systems.
+    files = [entry for entry in entries if entry.suffix.lower() == ".ply" and not entry.name.startswith(".")]
     if not files:
         raise CaptureError(f"{folder} is no folder with numbered .ply files, such as frame_000000.ply.")
     found: dict[int, Path] = {}
@@ -111,23 +113,25 @@ def read_header(path: Path) -> PlyHeader:
     """The header of a ``.ply`` of Gaussians. Raises CaptureError if it is not one, or lacks a property."""
     with path.open("rb") as file:
         data = file.read(_MAX_HEADER_BYTES)
-    text, separator, _ = data.partition(b"end_header\n")
-    lines = text.decode("ascii", "replace").split("\n")
-    if lines[0].strip() != "ply" or not separator:
+    end_of_header = re.search(rb"\nend_header\r?\n", data)
+    if data[:3] != b"ply" or end_of_header is None:
         raise CaptureError(f"{path} is not a .ply file.")
-    words = [line.split() for line in lines]
+    text = data[: end_of_header.start()]
+    words = [line.split() for line in text.decode("ascii", "replace").split("\n")]
     if ["format", "binary_little_endian", "1.0"] not in words:
         raise CaptureError(f"{path} is not binary little endian; convert it, for example with SuperSplat.")
     elements = [line for line in words if line[:1] == ["element"]]
-    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][2].isdigit():
+    if not elements or elements[0][1:2] != ["vertex"] or not "".join(elements[0][2:]).isdigit():
         hint = " (it is a compressed .ply of SuperSplat; save it uncompressed)" if b"element chunk" in text else ""
         raise CaptureError(f"{path} does not begin with an element vertex{hint}.")
     end = words.index(elements[1]) if len(elements) > 1 else len(words)
     fields = [line for line in words[:end] if line[:1] == ["property"]]
     if any(len(line) != 3 or line[1] not in TYPES for line in fields):
         raise CaptureError(f"{path} has properties of vertices that are lists or of unknown types.")
+    names = {name for _, _, name in fields}
+    if len(names) < len(fields):
+        raise CaptureError(f"{path} has two properties of one name, so which one is meant is unknown; write it again.")
     row = np.dtype([(name, TYPES[kind]) for _, kind, name in fields])
-    names = set(row.names or ())
     rest = len([name for name in names if name.startswith("f_rest_")])
     degree = math.isqrt(rest // 3 + 1) - 1
     wanted = properties(min(degree, MAX_SH_DEGREE))
@@ -135,19 +139,17 @@ def read_header(path: Path) -> PlyHeader:
         raise CaptureError(f"{path} lacks the property {missing[0]}; it is not a .ply of 3D Gaussian splatting.")
     if degree > MAX_SH_DEGREE or rest != 3 * ((degree + 1) ** 2 - 1):
         raise CaptureError(f"{path} has {rest} properties f_rest, which is no degree of spherical harmonics to 3.")
-    return PlyHeader(int(elements[0][2]), row, len(text) + len(separator), degree)
+    return PlyHeader(int(elements[0][2]), row, end_of_header.end(), degree)
 
 
 def read_ply(path: Path) -> BakedGaussians:
     """The Gaussians of a ``.ply``, in its units and axes; quaternions are normalised. Raises CaptureError if the file
     is not a ``.ply`` of Gaussians, is cut, or has values that are not finite."""
     header = read_header(path)
-    with path.open("rb") as file:
-        file.seek(header.offset)
-        data = file.read(header.count * header.row.itemsize)
-    if len(data) < header.count * header.row.itemsize:
-        raise CaptureError(f"{path} ends after {len(data) // header.row.itemsize} of {header.count} Gaussians.")
-    rows = np.frombuffer(data, header.row)
+    whole = max(path.stat().st_size - header.offset, 0) // header.row.itemsize
+    if whole < header.count:
+        raise CaptureError(f"{path} ends after {whole} of {header.count} Gaussians.")
+    rows = np.fromfile(path, header.row, header.count, offset=header.offset)
 
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([rows[name].astype(np.float32) for name in names], axis=1))
@@ -161,7 +163,9 @@ def read_ply(path: Path) -> BakedGaussians:
         opacities=columns("opacity")[:, 0].sigmoid(),
         sh=torch.cat([columns(*(f"f_dc_{i}" for i in range(3)))[:, None], *(r.transpose(1, 2) for r in rest)], dim=1),
     )
-    values = (found.means, found.scales, found.opacities, found.sh)
+    values = (found.means, found.quats, found.scales, found.opacities, found.sh)
     if bad := int((~torch.stack([v.reshape(count, -1).isfinite().all(1) for v in values]).all(0)).sum()):
-        raise CaptureError(f"{bad} of {count} Gaussians of {path} have values that are no finite numbers.")
+        raise CaptureError(
+            f"{bad} of {count} Gaussians of {path} have values that are no finite numbers; remove them in an editor."
+        )
     return found
