@@ -157,6 +157,14 @@ def test_the_ring_sees_the_gaussians_upright(down: tuple[float, float, float]) -
         assert (camera.center - middle) @ torch.tensor(down, dtype=torch.float64) < 0
 
 
+def test_what_a_stream_does_not_have_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Files of Mip-Splatting, whose ``filter_3D`` widens Gaussians, and of dynamic methods."""
+    [file] = write(tmp_path / "set", [some(5)])
+    file.write_bytes(file.read_bytes().replace(b"float nz\n", b"float filter_3D\n"))
+    assert main(["import", str(tmp_path / "set"), "-o", str(tmp_path / "x.sgs"), "--device", "cpu"]) == 0
+    assert "Not read, since a plain Gaussian has no such thing: filter_3D." in " ".join(capsys.readouterr().out.split())
+
+
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "set", [some(5, degree=1)])
     arguments = ["import", str(tmp_path / "set"), "-o", str(tmp_path / "x.sgs"), "--fps", "12"]

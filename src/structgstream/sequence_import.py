@@ -66,6 +66,7 @@ class ImportedSequence:
     far: int  # most Gaussians of a frame that are left out since they are too far away to be coded
     linked: bool  # whether Gaussians live on from frame to frame; else each frame is stored by itself
     degree: int  # degree of the spherical harmonics of the files
+    unread: tuple[str, ...]  # properties and elements of the files that a stream does not have
     color_psnr: float  # PSNR, dB, of pictures of frame 0 with one colour for each Gaussian, against the files
     psnr: float  # the same of the stream, which is quantized, too
 
@@ -163,7 +164,9 @@ def import_sequence(
                 color_psnr = pictures_psnr(whole, scene, cameras, backend)
                 psnr = pictures_psnr(whole, decoded, cameras, backend)
             on_frame()
-    return ImportedSequence(len(files), (min(counts), max(counts)), max(far), linked, first.degree, color_psnr, psnr)
+    unread = tuple(dict.fromkeys(name for header in headers for name in header.unread))
+    seen = (min(counts), max(counts))
+    return ImportedSequence(len(files), seen, max(far), linked, first.degree, unread, color_psnr, psnr)
 
 
 def same_rows(before: Tensor, after: Tensor) -> bool:

@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from structgstream.errors import CaptureError
 from structgstream.exporters.formats import FrameOptions
-from structgstream.exporters.ply import find_sequence, ply_bytes, read_ply
+from structgstream.exporters.ply import find_sequence, ply_bytes, read_header, read_ply
 from tests.support.plain import some
 
 
@@ -29,6 +29,7 @@ def test_another_library_s_file(degree: int, newline: bytes, tmp_path: Path) -> 
     PlyData([PlyElement.describe(rows, "vertex"), other], byte_order="<").write(str(tmp_path / "theirs.ply"))
     head, end, body = (tmp_path / "theirs.ply").read_bytes().partition(b"end_header\n")
     (tmp_path / "theirs.ply").write_bytes((head + end).replace(b"\n", newline) + body)
+    assert read_header(tmp_path / "theirs.ply").unread == ("label", "element other")
     found = read_ply(tmp_path / "theirs.ply")
     for name in ("means", "quats", "scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-6)

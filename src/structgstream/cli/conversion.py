@@ -238,6 +238,8 @@ def import_files(arguments: list[str]) -> None:
         print_lines(
             console, f"Left out: up to {found.far:,} Gaussians of a frame that are too far away for the stream's steps."
         )
+    if found.unread:
+        print_lines(console, f"Not read, since a plain Gaussian has no such thing: {', '.join(found.unread)}.")
     print_lines(
         console,
         "All files have the same Gaussians; the stream contains their changes."

@@ -74,6 +74,7 @@ class PlyHeader:
     row: np.dtype  # names and types of a Gaussian's properties
     offset: int  # byte at which the first row begins
     degree: int
+    unread: tuple[str, ...]  # what it has beside plain Gaussians
 
 
 def find_sequence(folder: Path) -> list[Path]:
@@ -139,7 +140,9 @@ def read_header(path: Path) -> PlyHeader:
         raise CaptureError(f"{path} lacks the property {missing[0]}; it is not a .ply of 3D Gaussian splatting.")
     if degree > MAX_SH_DEGREE or rest != 3 * ((degree + 1) ** 2 - 1):
         raise CaptureError(f"{path} has {rest} properties f_rest, which is no degree of spherical harmonics to 3.")
-    return PlyHeader(int(elements[0][2]), row, end_of_header.end(), degree)
+    unread = [name for _, _, name in fields if name not in wanted]
+    unread += [f"element {' '.join(element[1:2])}" for element in elements[1:] if element[2:] != ["0"]]
+    return PlyHeader(int(elements[0][2]), row, end_of_header.end(), degree, tuple(unread))
 
 
 def read_ply(path: Path) -> BakedGaussians:
