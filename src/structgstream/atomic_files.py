@@ -69,6 +69,7 @@ def partial_path(path: Path) -> Path:
 
 def side_path(stream: Path, ending: str) -> Path:
     """A side file of a stream, by its name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
+    stream = stream if stream.name else stream.absolute()  # "." has no name
     return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
 
 

@@ -48,6 +48,19 @@ def test_the_place_and_the_format(
     assert destination(STREAM, place, format=format, frame=frame, frames=None) == (Path(expected[0]), expected[1])
 
 
+def test_folders_of_segments_whose_names_have_dots_have_outputs_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for day in ("27", "28"):
+        stream = Path(f"/videos/studio.2026-11-{day}")
+        for format, frame, ending in (("html", None, ".html"), ("usd", None, ".usd"), ("ply", 3, "-3.ply")):
+            found, _ = destination(stream, None, format=format, frame=frame, frames=None)
+            assert found == Path(f"{stream}{ending}")
+    (tmp_path / "ball").mkdir()
+    monkeypatch.chdir(tmp_path / "ball")
+    assert destination(Path("."), None, format="html", frame=None, frames=None)[0] == tmp_path / "ball.html"
+
+
 def test_a_folder_that_is_there_is_a_folder_whatever_its_name(tmp_path: Path) -> None:
     folder = tmp_path / "set.ply"
     folder.mkdir()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
+from structgstream.atomic_files import side_path
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
 from structgstream.cli.progress import print_lines
@@ -241,7 +242,7 @@ def default_output(options: Render, reader: "StreamReader") -> Path:
     ending = "-compare" if options.compare else ""
     still = options.frame is not None and options.path is None
     suffix = f"-{options.frame}.png" if still else ".mp4"
-    return options.stream.with_name(f"{options.stream.stem}-{name}{ending}{suffix}")
+    return side_path(options.stream, f"-{name}{ending}{suffix}")
 
 
 def _along(reader: "StreamReader", views: "Sequence[Camera]", frame: int | None) -> "Iterator[tuple[Camera, Scene]]":

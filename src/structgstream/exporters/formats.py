@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from structgstream.atomic_files import side_path
 from structgstream.errors import ConfigError
 
 Format = Literal["ply", "splat", "spz", "sog", "glb", "usd", "4dgs"]
@@ -122,9 +123,8 @@ def destination(
     if output is None:
         format = format or "ply"
         if format == "html" or (format != "site" and FORMATS[format].all_frames and frame is None):
-            return stream.with_suffix(f".{format}"), format
-        name = f"{stream.stem}-{format}" if frame is None else f"{stream.stem}-{frame}.{format}"
-        return stream.with_name(name), format
+            return side_path(stream, f".{format}"), format
+        return side_path(stream, f"-{format}" if frame is None else f"-{frame}.{format}"), format
     ending = output.suffix.lower().lstrip(".")
     if format == "html" and (output.is_dir() or ending != "html"):
         raise ConfigError(f"a page is a file whose name ends in .html, unlike {output.name}.")

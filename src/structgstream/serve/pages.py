@@ -21,7 +21,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-from structgstream.atomic_files import atomic_write
+from structgstream.atomic_files import atomic_write, side_path
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.records import (
     PREFIX,
@@ -194,6 +194,11 @@ class StreamFile:
 
     path: Path
 
+    @property
+    def title(self) -> str:
+        """Its name for a page."""
+        return side_path(self.path, "").name
+
     def opened(self) -> FileBytes | StoredBytes:
         """The open stream at its present length. Raises StreamError if it cannot be read, or its first frames have been
         removed from the window."""
@@ -254,7 +259,7 @@ def write_page(path: Path, stream: StreamFile) -> int:
     """
     with stream.opened() as data:
         check_has_header(data, str(stream.path))
-        page = single_page(stream.path.stem, module=bundle(), stream=data)
+        page = single_page(stream.title, module=bundle(), stream=data)
     atomic_write(path, page, new_folder=True)
     return len(page)
 
@@ -274,7 +279,7 @@ def write_site(folder: Path, stream: StreamFile) -> int:
     copy = folder / "stream.sgs"
     if copy.exists() and copy.samefile(stream.path):
         raise StorageError(f"{copy} is the stream itself; name another folder.")
-    small = {"index.html": linked_page(stream.path.stem, stream="stream.sgs").encode(), "player.js": bundle().encode()}
+    small = {"index.html": linked_page(stream.title, stream="stream.sgs").encode(), "player.js": bundle().encode()}
     for name, content in small.items():
         atomic_write(folder / name, content, new_folder=True)
     with stream.opened() as data:
