@@ -74,6 +74,17 @@ def test_a_sequence_fills_a_folder(stream: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / "frame_000002.ply").read_bytes()
 
 
+def test_frames_of_an_earlier_export_in_a_folder_are_named(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["export", str(stream), "-o", str(tmp_path / "out"), "--device", "reference"]
+    assert main(arguments) == 0
+    assert "earlier export" not in capsys.readouterr().out
+    assert main([*arguments, "--frames", "0", "1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "also has 1 frame of an earlier export, such as frame_000002.ply;" in said
+
+
 def test_a_zip_has_the_files_of_the_folder(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ["export", str(stream), "--device", "reference", "--sh-degree", "0"]
     assert main([*common, "-o", str(tmp_path / "all")]) == 0

@@ -135,6 +135,13 @@ def export(arguments: list[str]) -> None:
             f"Plain Gaussians of frame {numbers[0]}, against the stream's own pictures: PSNR {loss.training:.1f} dB at "
             f"the training cameras{held_out}.",
         )
+    others = sorted(set(output.glob(f"frame_*.{format}")) - files) if output.is_dir() else []
+    if others:
+        print_lines(
+            console,
+            f"{output} also has {frames_text(len(others))} of an earlier export, such as {others[-1].name}; viewers "
+            "take all of them for one sequence.",
+        )
     if reader.damage:
         print_lines(console, f"The stream is damaged: {reader.cut_reason}.")
 
