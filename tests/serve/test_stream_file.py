@@ -65,6 +65,16 @@ def test_a_site_never_replaces_its_own_stream(tmp_path: Path) -> None:
     assert path.read_bytes() == STREAM
 
 
+def test_a_site_replaces_an_earlier_one_and_no_other_page(stream: StreamFile, tmp_path: Path) -> None:
+    page = tmp_path / "www" / "index.html"
+    for _ in range(2):
+        write_site(page.parent, stream)
+    page.write_text("<h1>My pages</h1>")
+    with pytest.raises(StorageError, match="is another page"):
+        write_site(page.parent, stream)
+    assert page.read_text() == "<h1>My pages</h1>"
+
+
 def test_what_cannot_be_shown_is_not_written(stream: StreamFile, tmp_path: Path) -> None:
     stream.path.write_bytes(STREAM[:100])
     for writing in (write_page, write_site):

@@ -273,12 +273,15 @@ def write_site(folder: Path, stream: StreamFile) -> int:
     Raises:
         PlayerError: the installation lacks the player.
         StreamError: no frame of the stream can be decoded.
-        StorageError: a file cannot be written, or would replace the stream itself.
+        StorageError: a file cannot be written, or would replace the stream itself or a page without a player.
     """
     stream.check()
     copy = folder / "stream.sgs"
     if copy.exists() and copy.samefile(stream.path):
         raise StorageError(f"{copy} is the stream itself; name another folder.")
+    page = folder / "index.html"
+    if page.exists() and b"<structgstream-player" not in page.read_bytes():
+        raise StorageError(f"{page} is another page, which the site would replace; name another folder.")
     small = {"index.html": linked_page(stream.title, stream="stream.sgs").encode(), "player.js": bundle().encode()}
     for name, content in small.items():
         atomic_write(folder / name, content, new_folder=True)
