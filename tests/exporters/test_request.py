@@ -51,9 +51,11 @@ def test_the_place_and_the_format(
 def test_folders_of_segments_whose_names_have_dots_have_outputs_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    asked: list[tuple[Format | PageFormat, int | None, str]]
+    asked = [("html", None, ".html"), ("usd", None, ".usd"), ("ply", 3, "-3.ply")]
     for day in ("27", "28"):
         stream = Path(f"/videos/studio.2026-11-{day}")
-        for format, frame, ending in (("html", None, ".html"), ("usd", None, ".usd"), ("ply", 3, "-3.ply")):
+        for format, frame, ending in asked:
             found, _ = destination(stream, None, format=format, frame=frame, frames=None)
             assert found == Path(f"{stream}{ending}")
     (tmp_path / "ball").mkdir()
