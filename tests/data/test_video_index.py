@@ -93,6 +93,13 @@ def test_interlaced_videos_are_refused(tmp_path: Path) -> None:
     )
 
 
+def test_a_matrix_that_is_not_converted_is_refused(tmp_path: Path) -> None:
+    """Screen recorders write YCgCo; read as BT.709 it is green and violet."""
+    options = {"x264-params": "colormatrix=YCgCo"}
+    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
+    assert "a.mp4 states a colour matrix (YCgCo) that is not read; expected RGB, BT.601" in refusal(tmp_path / "a.mp4")
+
+
 def test_ten_bit_hevc_is_read(tmp_path: Path) -> None:
     for name in RIG:
         quiet = {"x265-params": "log-level=none:lossless=1"}

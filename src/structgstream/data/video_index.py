@@ -48,8 +48,10 @@ TRANSFERS = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 6: "BT.601", 7: "SMPTE
              17: "SMPTE 428", HLG: "HLG"}  # fmt: skip
 PRIMARIES = {1: "BT.709", 4: "BT.470M", 5: "BT.470BG", 6: "SMPTE 170M", 7: "SMPTE 240M", BT2020: "BT.2020",
              11: "DCI-P3", 12: "Display P3"}  # fmt: skip
-MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 8: "YCgCo", 9: "BT.2020",
+MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020",
             10: "BT.2020 constant luminance"}  # fmt: skip
+UNREAD_MATRICES = {8: "YCgCo", 11: "SMPTE 2085", 12: "chromaticity-derived", 13: "chromaticity-derived", 14: "ICtCp",
+                   15: "IPT, as Dolby Vision's profile 5", 16: "YCgCo-R", 17: "YCgCo-R"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -254,7 +256,8 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     """What a video states of its colours by one of its frames, in words; None where none decodes.
 
     Raises:
-        CaptureError: a transfer function that is not converted, or wide primaries without any, as log videos have.
+        CaptureError: a transfer function or a matrix that is not converted, or wide primaries without any, as log
+            videos have.
     """
     if frame is None:
         return "no frame decodes"
@@ -270,6 +273,11 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
         raise CaptureError(
             f"The video {path} states a transfer function ({what}) that is not read; expected BT.709, sRGB, BT.2020, "
             "HLG or PQ: convert it to BT.709, keeping the time of each frame."
+        )
+    if (unread := UNREAD_MATRICES.get(int(frame.colorspace))) is not None:
+        raise CaptureError(
+            f"The video {path} states a colour matrix ({unread}) that is not read; expected RGB, BT.601, BT.709 or "
+            "BT.2020: convert it to BT.709, keeping the time of each frame."
         )
     matrix = MATRICES.get(int(frame.colorspace), "no matrix stated")
     bounds = {1: "limited range", 2: "full range"}.get(int(frame.color_range), "no range stated")
