@@ -11,7 +11,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.camera_files import files_of
@@ -221,6 +221,17 @@ def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) 
     with pytest.raises(CaptureError, match="cut or damaged.; restore it, or move it out") as raised:
         read_picture(tmp_path / "b.jpg")
     assert "delete" not in str(raised.value)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "avif"])
+def test_pictures_of_another_color_profile_are_converted_to_srgb(tmp_path: Path, suffix: str) -> None:
+    """Phones write Display P3, cameras Adobe RGB; here red and green are exchanged."""
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    exchanged = srgb.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")
+    for profile, color in ((srgb, (200, 100, 50)), (exchanged, (100, 200, 50)), (b"damaged", (200, 100, 50))):
+        image = Image.new("RGB", (64, 48), (200, 100, 50))
+        image.save(tmp_path / f"a.{suffix}", icc_profile=profile, quality=100)
+        np.testing.assert_allclose(read_picture(tmp_path / f"a.{suffix}")[20, 30], color, atol=4)
 
 
 def test_float_pictures_and_heic_are_refused_for_what_they_are(tmp_path: Path) -> None:

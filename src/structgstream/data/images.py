@@ -12,11 +12,11 @@ import re
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import repeat
 from pathlib import Path
 from types import ModuleType
@@ -41,6 +41,8 @@ HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b
 ORIENTATION = 0x0112  # the tag, in EXIF as in TIFF
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
+SAME_COLORS = 3
+"""Levels of 255 by which a profile may change a colour and be sRGB all the same."""
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +162,39 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
                 "expected one depth: export all pictures again with 8 or 16 bits."
             )
         stored = (stored >> (bits - 8)).astype(np.uint8)
-    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB), mask
+    picture = cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB)
+    with _opened(path) as header:
+        profile = None if header is None else header.info.get("icc_profile")
+    return _in_srgb(picture, profile), mask
+
+
+def _in_srgb(picture: NDArray[np.uint8], profile: bytes | None) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` whose values are colours of an ICC profile (Display P3, Adobe RGB), in sRGB."""
+    convert = _to_srgb(profile) if profile else None
+    return picture if convert is None else convert(picture)
+
+
+@cache
+def _to_srgb(profile: bytes) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
+    """Converts pictures ``[H, W, 3]`` of an ICC profile; None for sRGB, in its many spellings, and for profiles that
+    are damaged or not of RGB."""
+    from PIL import Image, ImageCms
+
+    if profile[16:20] != b"RGB ":
+        return None
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return None
+
+    def convert(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.array(ImageCms.applyTransform(Image.fromarray(picture), transform))
+
+    levels = np.arange(0, 256, 15).astype(np.uint8)
+    cube = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(len(levels), -1, 3)
+    change = np.abs(convert(cube).astype(np.int16) - cube)
+    return convert if change.max() > SAME_COLORS else None
 
 
 def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
@@ -281,7 +315,9 @@ def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
             import pillow_heif  # pyright: ignore[reportMissingImports]
 
             image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
-        pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+        pixels = np.array(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+        if not is_avif:  # Pillow does not read its header, by which others are converted
+            pixels[..., :3] = _in_srgb(np.ascontiguousarray(pixels[..., :3]), image.info.get("icc_profile"))
     except ImportError:
         raise CaptureError(
             f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG."
