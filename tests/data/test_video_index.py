@@ -100,6 +100,14 @@ def test_a_matrix_that_is_not_converted_is_refused(tmp_path: Path) -> None:
     assert "a.mp4 states a colour matrix (YCgCo) that is not read; expected RGB, BT.601" in refusal(tmp_path / "a.mp4")
 
 
+@pytest.mark.parametrize("transfer", ["undef", "bt2020-10"])
+def test_wide_primaries_in_standard_range_are_refused(tmp_path: Path, transfer: str) -> None:
+    """Log videos state no transfer function; others would be shown pale."""
+    options = {"x264-params": f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc"}
+    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
+    assert "a.mp4 has the primaries of BT.2020 and does not state HLG or PQ" in refusal(tmp_path / "a.mp4")
+
+
 def test_ten_bit_hevc_is_read(tmp_path: Path) -> None:
     for name in RIG:
         quiet = {"x265-params": "log-level=none:lossless=1"}

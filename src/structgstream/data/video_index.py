@@ -256,17 +256,17 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     """What a video states of its colours by one of its frames, in words; None where none decodes.
 
     Raises:
-        CaptureError: a transfer function or a matrix that is not converted, or wide primaries without any, as log
-            videos have.
+        CaptureError: a transfer function or a matrix that is not converted, or wide primaries without HLG or PQ, as
+            log videos have.
     """
     if frame is None:
         return "no frame decodes"
     transfer, primaries = transfer_of(frame), int(getattr(frame, "color_primaries", UNSPECIFIED))
-    if transfer == UNSPECIFIED and primaries == BT2020:
+    if transfer not in HIGH_RANGE and primaries == BT2020:
         raise CaptureError(
-            f"The video {path} has the primaries of BT.2020 and does not state its transfer function, as log videos "
-            "have it, so its colours are unknown; convert it to BT.709 with the camera maker's conversion, keeping the "
-            "time of each frame, or film in standard range."
+            f"The video {path} has the primaries of BT.2020 and does not state HLG or PQ, as log videos have it, so "
+            "its colours are not those of sRGB; convert it to BT.709 with the camera maker's conversion, keeping the "
+            "time of each frame, or film in BT.709."
         )
     if transfer not in DISPLAY_REFERRED | HIGH_RANGE:
         what = TRANSFERS.get(transfer, f"number {transfer}")
