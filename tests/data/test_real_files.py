@@ -15,7 +15,7 @@ from PIL import Image, ImageCms
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.camera_files import files_of
-from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
+from structgstream.data.images import ImageSource, common_pictures, picture_size, read_picture, turned
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.video import high_range_to_srgb, synchronised
@@ -221,6 +221,16 @@ def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) 
     with pytest.raises(CaptureError, match="cut or damaged.; restore it, or move it out") as raised:
         read_picture(tmp_path / "b.jpg")
     assert "delete" not in str(raised.value)
+
+
+def test_a_tiff_that_holds_a_take_is_refused_but_not_one_with_a_thumbnail(tmp_path: Path) -> None:
+    """ImageJ and frame grabbers write stacks."""
+    picture, small = (Image.new("RGB", size, (200, 100, 50)) for size in ((64, 48), (16, 12)))
+    picture.save(tmp_path / "a.tif", save_all=True, append_images=[picture] * 4)
+    with pytest.raises(CaptureError, match="a.tif has several pages of one size, of which the first alone would be"):
+        picture_size(tmp_path / "a.tif")
+    picture.save(tmp_path / "b.tif", save_all=True, append_images=[small])
+    assert picture_size(tmp_path / "b.tif") == (64, 48)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "avif"])

@@ -39,6 +39,7 @@ PICTURE_SUFFIXES = frozenset({
 })  # fmt: skip
 HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
 ORIENTATION = 0x0112  # the tag, in EXIF as in TIFF
+TIFF_SIZE = (0x0100, 0x0101)  # the tags of width and height
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
 SAME_COLORS = 3
@@ -247,7 +248,7 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
     if data[:4] in (b"II*\0", b"MM\0*"):
-        data = _upright_tiff(data)
+        data = _upright_tiff(path, data)
     jpeg = data[:2] == b"\xff\xd8"
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if jpeg else cv2.IMREAD_UNCHANGED
     try:
@@ -271,19 +272,35 @@ def _undecodable(path: Path, data: bytes) -> CaptureError:
     )
 
 
-def _upright_tiff(data: bytes) -> bytes:
-    """The same file with the orientation 1, since OpenCV turns pictures of TIFF whatever it is asked for."""
+def _upright_tiff(path: Path, data: bytes) -> bytes:
+    """The same file with the orientation 1, since OpenCV turns pictures of TIFF whatever it is asked for.
+
+    One that holds a take is refused; a thumbnail may follow the picture.
+    """
     order = "<" if data[:2] == b"II" else ">"
     changed = bytearray(data)
     try:
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, at)
-        for entry in range(at + 2, at + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
-                struct.pack_into(f"{order}H", changed, entry + 8, 1)
+        first, following = _tiff_directory(data, order, *struct.unpack_from(f"{order}I", data, 4))
+        second = _tiff_directory(data, order, following)[0] if following else {}
+        if ORIENTATION in first:
+            struct.pack_into(f"{order}H", changed, first[ORIENTATION] + 8, 1)
     except struct.error:
         return data  # cut, which the decoder notices
+    sizes = [[data[own[tag] + 2 : own[tag] + 12] for tag in TIFF_SIZE if tag in own] for own in (first, second)]
+    if sizes[0] == sizes[1] != []:
+        raise CaptureError(
+            f"The picture {path} has several pages of one size, of which the first alone would be read; expected one "
+            "picture a file: write each page to a file of its own (CAMERA/000000.tif, CAMERA/000001.tif, ...)."
+        )
     return bytes(changed)
+
+
+def _tiff_directory(data: bytes, order: str, at: int) -> tuple[dict[int, int], int]:
+    """Where each tag of a TIFF's directory has its entry, and where the next directory lies; 0 without one."""
+    (count,) = struct.unpack_from(f"{order}H", data, at)
+    entries = range(at + 2, at + 2 + 12 * count, 12)
+    (following,) = struct.unpack_from(f"{order}I", data, entries.stop)
+    return {struct.unpack_from(f"{order}H", data, entry)[0]: entry for entry in entries}, following
 
 
 def is_cut_jpeg(data: bytes) -> bool:
