@@ -2,6 +2,7 @@
 """Pictures and videos as cameras and recorders write them."""
 
 import logging
+import struct
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +16,14 @@ from PIL import Image, ImageCms
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.camera_files import files_of
-from structgstream.data.images import ImageSource, common_pictures, picture_size, read_picture, turned
+from structgstream.data.images import (
+    ImageSource,
+    common_pictures,
+    picture_size,
+    read_picture,
+    read_picture_and_mask,
+    turned,
+)
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.video import high_range_to_srgb, synchronised
@@ -211,6 +219,16 @@ def test_what_alpha_hides_does_not_count(tmp_path: Path) -> None:
     assert frame.masks["cam00"][10:].all()
     deep = stored.astype(np.uint16) << 4  # 12 bits, of alpha too
     assert next(picture_source(tmp_path, deep).frames()).masks["cam00"][10:].all()
+
+
+def test_the_fourth_byte_of_a_bmp_hides_nothing(tmp_path: Path) -> None:
+    stored = np.full((4, 4, 4), (50, 100, 200, 0), np.uint8)  # blue, green, red, unused
+    header = struct.pack("<IiiHHIIiiIIIII", 52, 4, 4, 1, 32, 3, stored.nbytes, 0, 0, 0, 0, 0xFF0000, 0xFF00, 0xFF)
+    start = struct.pack("<2sIHHI", b"BM", 14 + len(header) + stored.nbytes, 0, 0, 14 + len(header))
+    (tmp_path / "a.bmp").write_bytes(start + header + stored.tobytes())
+    picture, mask = read_picture_and_mask(tmp_path / "a.bmp")
+    assert mask is None
+    assert (picture == (200, 100, 50)).all()
 
 
 def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) -> None:

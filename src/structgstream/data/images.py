@@ -249,8 +249,8 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
     if data[:4] in (b"II*\0", b"MM\0*"):
         data = _upright_tiff(path, data)
-    jpeg = data[:2] == b"\xff\xd8"
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if jpeg else cv2.IMREAD_UNCHANGED
+    plain = data[:2] in (b"\xff\xd8", b"BM")  # JPEG; BMP, whose fourth byte is mostly unused, and 0
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if plain else cv2.IMREAD_UNCHANGED
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
