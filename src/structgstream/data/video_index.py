@@ -69,6 +69,7 @@ class VideoTrack:
     origin: int = 0  # ticks of time 0. AVI states no presentation times; its first frame is at 0
     container: str = ""  # FFmpeg's name of the container
     start: int = 0  # presentation time, in ticks, of the first picture, which may be one that does not decode
+    pixel_aspect: float = 1.0  # how many times as wide as high a stored pixel is to be shown; anamorphic ones are not 1
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -176,7 +177,8 @@ def _scan(path: Path) -> VideoTrack:
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
         colors = stated_colors(path, first)
         keyframes, kind = tuple(sorted(keys)), container.format.name
-        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start)
+        aspect = float(stream.sample_aspect_ratio or 1)
+        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start, aspect)
 
 
 def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:
