@@ -398,11 +398,21 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def check_one_series(camera: str, files: Iterable[Path]) -> None:
-    """Refuses pictures of one camera whose names differ by more than numbers and that have several sizes
-    (thumbnails)."""
+    """Refuses pictures of one camera that are of several series: names that differ by more than numbers, where the
+    numbers are the same (depth maps, masks) or sizes are not (thumbnails)."""
     firsts: dict[str, Path] = {}
+    numbered: dict[tuple[int, ...], tuple[str, Path]] = {}
     for file in files:
-        firsts.setdefault(re.sub(r"\d+", "0", file.stem), file)
+        kind = re.sub(r"\d+", "0", file.stem)
+        firsts.setdefault(kind, file)
+        numbers = tuple(map(int, re.findall(r"\d+", file.stem)))
+        other, same = numbered.setdefault(numbers, (kind, file))
+        if numbers and other != kind:
+            raise CaptureError(
+                f"The pictures of camera {camera!r} in {file.parent} are of several series: {same.name} and "
+                f"{file.name} have the same number; expected one: move the other one out of the folder (masks to "
+                "masks/CAMERA)."
+            )
     series = [*firsts.values()][:MAX_SERIES] if len(firsts) > 1 else []
     sizes = {picture_size(file): file for file in series}
     if len(sizes) > 1:
