@@ -251,7 +251,7 @@ def test_a_tiff_that_holds_a_take_is_refused_but_not_one_with_a_thumbnail(tmp_pa
     assert picture_size(tmp_path / "b.tif") == (64, 48)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "avif"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 def test_pictures_of_another_color_profile_are_converted_to_srgb(tmp_path: Path, suffix: str) -> None:
     """Phones write Display P3, cameras Adobe RGB; here red and green are exchanged."""
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
