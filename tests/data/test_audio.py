@@ -47,6 +47,21 @@ def test_sample_k_sounds_at_k_over_the_rate(tmp_path: Path, start: float) -> Non
     assert not samples[: round(start * RATE) - 60 if start else 0].any()
 
 
+def test_gaps_in_the_time_stamps_are_silence_and_what_comes_twice_is_left_out(tmp_path: Path) -> None:
+    """Recorders of streams lose packets, and send some again."""
+    block = RATE // 10
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        sound = container.add_stream("pcm_f32le", rate=RATE)
+        sound.layout = "mono"
+        for number in (0, 1, 5, 5, 6):  # tenths of a second
+            frame = av.AudioFrame.from_ndarray(np.full((1, block), 0.1 * number, np.float32), "flt", "mono")
+            frame.sample_rate, frame.pts = RATE, number * block
+            container.mux(sound.encode(frame))
+    samples = read_audio(tmp_path / "a.mkv")
+    assert samples is not None
+    np.testing.assert_allclose(samples.reshape(7, block)[:, block // 2], [0, 0.1, 0, 0, 0, 0.5, 0.6], atol=1e-6)
+
+
 def test_another_rate_is_converted(tmp_path: Path) -> None:
     samples = read_audio(with_sound(tmp_path / "a.mkv", rate=16_000))
     assert samples is not None

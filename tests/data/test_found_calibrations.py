@@ -155,11 +155,21 @@ def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
     check_opens(tmp_path)
 
 
-def test_thumbnails_among_the_pictures_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stem", "step", "words"),
+    [
+        ("thumb", 2, "several sizes, frame_000000.png of .* and thumb.png of"),
+        ("thumb_000000", 2, "several series: frame_000000.png and thumb_000000.png have the same number"),
+        ("depth_000000", 1, "several series: depth_000000.png and frame_000000.png have the same number"),
+        ("frame_000000_mask", 1, "several series: frame_000000.png and frame_000000_mask.png have the same number"),
+    ],
+)
+def test_a_second_series_among_the_pictures_is_refused(tmp_path: Path, stem: str, step: int, words: str) -> None:
+    """Depth maps and masks were read as frames."""
     pictures(tmp_path, "images/CAM/frame_FRAME.png")
     model(tmp_path / "sparse/0")
-    write_picture(tmp_path / "images/cam01/thumb_000000.png", picture(1, 0)[::2, ::2])
-    with pytest.raises(CaptureError, match=r"camera 'cam01' in .* are of several sizes, frame_000000.png of .*thumb_0"):
+    write_picture(tmp_path / f"images/cam01/{stem}.png", picture(1, 0)[::step, ::step])
+    with pytest.raises(CaptureError, match=f"camera 'cam01' in .* are of {words}"):
         open_capture(tmp_path)
 
 

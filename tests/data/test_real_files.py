@@ -2,6 +2,7 @@
 """Pictures and videos as cameras and recorders write them."""
 
 import logging
+import struct
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -11,11 +12,18 @@ import av
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.camera_files import files_of
-from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
+from structgstream.data.images import (
+    ImageSource,
+    common_pictures,
+    picture_size,
+    read_picture,
+    read_picture_and_mask,
+    turned,
+)
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.video import high_range_to_srgb, synchronised
@@ -213,6 +221,16 @@ def test_what_alpha_hides_does_not_count(tmp_path: Path) -> None:
     assert next(picture_source(tmp_path, deep).frames()).masks["cam00"][10:].all()
 
 
+def test_the_fourth_byte_of_a_bmp_hides_nothing(tmp_path: Path) -> None:
+    stored = np.full((4, 4, 4), (50, 100, 200, 0), np.uint8)  # blue, green, red, unused
+    header = struct.pack("<IiiHHIIiiIIIII", 52, 4, 4, 1, 32, 3, stored.nbytes, 0, 0, 0, 0, 0xFF0000, 0xFF00, 0xFF)
+    start = struct.pack("<2sIHHI", b"BM", 14 + len(header) + stored.nbytes, 0, 0, 14 + len(header))
+    (tmp_path / "a.bmp").write_bytes(start + header + stored.tobytes())
+    picture, mask = read_picture_and_mask(tmp_path / "a.bmp")
+    assert mask is None
+    assert (picture == (200, 100, 50)).all()
+
+
 def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) -> None:
     content = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))[1].tobytes()
     (tmp_path / "a.jpg").write_bytes(content + bytes(9000))
@@ -221,6 +239,27 @@ def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) 
     with pytest.raises(CaptureError, match="cut or damaged.; restore it, or move it out") as raised:
         read_picture(tmp_path / "b.jpg")
     assert "delete" not in str(raised.value)
+
+
+def test_a_tiff_that_holds_a_take_is_refused_but_not_one_with_a_thumbnail(tmp_path: Path) -> None:
+    """ImageJ and frame grabbers write stacks."""
+    picture, small = (Image.new("RGB", size, (200, 100, 50)) for size in ((64, 48), (16, 12)))
+    picture.save(tmp_path / "a.tif", save_all=True, append_images=[picture] * 4)
+    with pytest.raises(CaptureError, match="a.tif has several pages of one size, of which the first alone would be"):
+        picture_size(tmp_path / "a.tif")
+    picture.save(tmp_path / "b.tif", save_all=True, append_images=[small])
+    assert picture_size(tmp_path / "b.tif") == (64, 48)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+def test_pictures_of_another_color_profile_are_converted_to_srgb(tmp_path: Path, suffix: str) -> None:
+    """Phones write Display P3, cameras Adobe RGB; here red and green are exchanged."""
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    exchanged = srgb.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")
+    for profile, color in ((srgb, (200, 100, 50)), (exchanged, (100, 200, 50)), (b"damaged", (200, 100, 50))):
+        image = Image.new("RGB", (64, 48), (200, 100, 50))
+        image.save(tmp_path / f"a.{suffix}", icc_profile=profile, quality=100)
+        np.testing.assert_allclose(read_picture(tmp_path / f"a.{suffix}")[20, 30], color, atol=4)
 
 
 def test_float_pictures_and_heic_are_refused_for_what_they_are(tmp_path: Path) -> None:

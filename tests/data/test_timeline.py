@@ -32,6 +32,13 @@ def test_numbers_sort_by_value() -> None:
     assert sorted(["cam10", "cam2", "a", "30", "4"], key=natural) == ["4", "30", "a", "cam2", "cam10"]
 
 
+def test_times_in_names_sort_by_value_whatever_their_number_of_decimals() -> None:
+    """``str(time.time())`` leaves out the last zeros."""
+    times = ["1700000000.05", "1700000000.1", "1700000000.1333", "1700000000.16", "1700000000.2"]
+    assert sorted(times, key=natural) == times
+    assert slots(a=" ".join(times), b=" ".join(times[1:])) == {"a": [0, 1, 2, 3, 4], "b": [1, 2, 3, 4]}
+
+
 def test_a_late_start_and_an_early_end_cut_the_range_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         assert common(a=[0, 1, 2, 3], b=[1, 2, 3, 4, 5]) == range(1, 4)

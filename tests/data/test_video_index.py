@@ -38,6 +38,7 @@ def write(
     mirrored: bool = False,
     options: Mapping[str, str] | None = None,
     interlaced: bool = False,
+    aspect: Fraction | None = None,
 ) -> None:
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=30, options=dict(options or {}))
@@ -45,6 +46,8 @@ def write(
         stream.pix_fmt = pixels
         if interlaced:
             stream.codec_context.flags |= Flags.interlaced_dct | Flags.interlaced_me
+        if aspect is not None:
+            stream.codec_context.sample_aspect_ratio = aspect
         if turn is not None:
             stream.set_display_rotation(turn, hflip=mirrored)
         for number, image in enumerate(pictures):
@@ -91,6 +94,28 @@ def test_interlaced_videos_are_refused(tmp_path: Path) -> None:
     assert "a.mp4 is interlaced: its lines are of two instants; set the camera to a progressive" in refusal(
         tmp_path / "a.mp4"
     )
+
+
+def test_the_shape_of_pixels_is_read(tmp_path: Path) -> None:
+    for name, aspect in (("a", Fraction(4, 3)), ("b", None)):
+        write(tmp_path / f"{name}.mp4", [corners()] * 2, aspect=aspect)
+        expected = pytest.approx(float(aspect or 1))
+        assert scan_videos({"a": tmp_path / f"{name}.mp4"})["a"].pixel_aspect == expected
+
+
+def test_a_matrix_that_is_not_converted_is_refused(tmp_path: Path) -> None:
+    """Screen recorders write YCgCo; read as BT.709 it is green and violet."""
+    options = {"x264-params": "colormatrix=YCgCo"}
+    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
+    assert "a.mp4 states a colour matrix (YCgCo) that is not read; expected RGB, BT.601" in refusal(tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize("transfer", ["undef", "bt2020-10"])
+def test_wide_primaries_in_standard_range_are_refused(tmp_path: Path, transfer: str) -> None:
+    """Log videos state no transfer function; others would be shown pale."""
+    options = {"x264-params": f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc"}
+    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
+    assert "a.mp4 has the primaries of BT.2020 and does not state HLG or PQ" in refusal(tmp_path / "a.mp4")
 
 
 def test_ten_bit_hevc_is_read(tmp_path: Path) -> None:

@@ -85,6 +85,22 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
     check_used(given, there, PrepareOptions(lens="fisheye", refine=True))
 
 
+def test_pixels_that_are_not_square_need_a_calibration_of_another_tool(tmp_path: Path) -> None:
+    """As of HDV and of anamorphic modes; the ratio of the focal lengths would hardly follow."""
+    write_room(tmp_path, cameras=3)
+    there = find_footage(tmp_path)
+    given = chosen_method(there, PrepareOptions())
+    for aspect, refused in ((4 / 3, True), (2025 / 2024, False)):
+        one = there.tracks["cam01"]
+        filmed = replace(there, tracks={**there.tracks, "cam01": replace(one, pixel_aspect=aspect)})
+        check_used(given, filmed, PrepareOptions())
+        if refused:
+            with pytest.raises(CaptureError, match=r"cam01\.mp4 are 1\.33 times as wide as high .*square pixels"):
+                check_used("sfm", filmed, PrepareOptions())
+        else:
+            check_used("sfm", filmed, PrepareOptions())
+
+
 def test_every_camera_is_placed_or_named(tmp_path: Path) -> None:
     found = solved(ring(3, radius=2.6, arc_degrees=40))
     assert check_complete(found, footage(tmp_path, "cam00", "cam02")) is found

@@ -12,11 +12,11 @@ import re
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import repeat
 from pathlib import Path
 from types import ModuleType
@@ -39,8 +39,11 @@ PICTURE_SUFFIXES = frozenset({
 })  # fmt: skip
 HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
 ORIENTATION = 0x0112  # the tag, in EXIF as in TIFF
+TIFF_SIZE = (0x0100, 0x0101)  # the tags of width and height
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
+SAME_COLORS = 3
+"""Levels of 255 by which a profile may change a colour and be sRGB all the same."""
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +163,39 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
                 "expected one depth: export all pictures again with 8 or 16 bits."
             )
         stored = (stored >> (bits - 8)).astype(np.uint8)
-    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB), mask
+    picture = cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB)
+    with _opened(path) as header:
+        profile = None if header is None else header.info.get("icc_profile")
+    return _in_srgb(picture, profile), mask
+
+
+def _in_srgb(picture: NDArray[np.uint8], profile: bytes | None) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` whose values are colours of an ICC profile (Display P3, Adobe RGB), in sRGB."""
+    convert = _to_srgb(profile) if profile else None
+    return picture if convert is None else convert(picture)
+
+
+@cache
+def _to_srgb(profile: bytes) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
+    """Converts pictures ``[H, W, 3]`` of an ICC profile; None for sRGB, in its many spellings, and for profiles that
+    are damaged or not of RGB."""
+    from PIL import Image, ImageCms
+
+    if profile[16:20] != b"RGB ":
+        return None
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return None
+
+    def convert(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.array(ImageCms.applyTransform(Image.fromarray(picture), transform))
+
+    levels = np.arange(0, 256, 15).astype(np.uint8)
+    cube = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(len(levels), -1, 3)
+    change = np.abs(convert(cube).astype(np.int16) - cube)
+    return convert if change.max() > SAME_COLORS else None
 
 
 def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
@@ -213,9 +248,9 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
     if data[:4] in (b"II*\0", b"MM\0*"):
-        data = _upright_tiff(data)
-    jpeg = data[:2] == b"\xff\xd8"
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if jpeg else cv2.IMREAD_UNCHANGED
+        data = _upright_tiff(path, data)
+    plain = data[:2] in (b"\xff\xd8", b"BM")  # JPEG; BMP, whose fourth byte is mostly unused, and 0
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if plain else cv2.IMREAD_UNCHANGED
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -237,19 +272,35 @@ def _undecodable(path: Path, data: bytes) -> CaptureError:
     )
 
 
-def _upright_tiff(data: bytes) -> bytes:
-    """The same file with the orientation 1, since OpenCV turns pictures of TIFF whatever it is asked for."""
+def _upright_tiff(path: Path, data: bytes) -> bytes:
+    """The same file with the orientation 1, since OpenCV turns pictures of TIFF whatever it is asked for.
+
+    One that holds a take is refused; a thumbnail may follow the picture.
+    """
     order = "<" if data[:2] == b"II" else ">"
     changed = bytearray(data)
     try:
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, at)
-        for entry in range(at + 2, at + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
-                struct.pack_into(f"{order}H", changed, entry + 8, 1)
+        first, following = _tiff_directory(data, order, *struct.unpack_from(f"{order}I", data, 4))
+        second = _tiff_directory(data, order, following)[0] if following else {}
+        if ORIENTATION in first:
+            struct.pack_into(f"{order}H", changed, first[ORIENTATION] + 8, 1)
     except struct.error:
         return data  # cut, which the decoder notices
+    sizes = [[data[own[tag] + 2 : own[tag] + 12] for tag in TIFF_SIZE if tag in own] for own in (first, second)]
+    if sizes[0] == sizes[1] != []:
+        raise CaptureError(
+            f"The picture {path} has several pages of one size, of which the first alone would be read; expected one "
+            "picture a file: write each page to a file of its own (CAMERA/000000.tif, CAMERA/000001.tif, ...)."
+        )
     return bytes(changed)
+
+
+def _tiff_directory(data: bytes, order: str, at: int) -> tuple[dict[int, int], int]:
+    """Where each tag of a TIFF's directory has its entry, and where the next directory lies; 0 without one."""
+    (count,) = struct.unpack_from(f"{order}H", data, at)
+    entries = range(at + 2, at + 2 + 12 * count, 12)
+    (following,) = struct.unpack_from(f"{order}I", data, entries.stop)
+    return {struct.unpack_from(f"{order}H", data, entry)[0]: entry for entry in entries}, following
 
 
 def is_cut_jpeg(data: bytes) -> bool:
@@ -281,7 +332,9 @@ def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
             import pillow_heif  # pyright: ignore[reportMissingImports]
 
             image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
-        pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+        pixels = np.array(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+        if not is_avif:  # Pillow does not read its header, by which others are converted
+            pixels[..., :3] = _in_srgb(np.ascontiguousarray(pixels[..., :3]), image.info.get("icc_profile"))
     except ImportError:
         raise CaptureError(
             f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG."
@@ -345,11 +398,21 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def check_one_series(camera: str, files: Iterable[Path]) -> None:
-    """Refuses pictures of one camera whose names differ by more than numbers and that have several sizes
-    (thumbnails)."""
+    """Refuses pictures of one camera that are of several series: names that differ by more than numbers, where the
+    numbers are the same (depth maps, masks) or sizes are not (thumbnails)."""
     firsts: dict[str, Path] = {}
+    numbered: dict[tuple[int, ...], tuple[str, Path]] = {}
     for file in files:
-        firsts.setdefault(re.sub(r"\d+", "0", file.stem), file)
+        kind = re.sub(r"\d+", "0", file.stem)
+        firsts.setdefault(kind, file)
+        numbers = tuple(map(int, re.findall(r"\d+", file.stem)))
+        other, same = numbered.setdefault(numbers, (kind, file))
+        if numbers and other != kind:
+            raise CaptureError(
+                f"The pictures of camera {camera!r} in {file.parent} are of several series: {same.name} and "
+                f"{file.name} have the same number; expected one: move the other one out of the folder (masks to "
+                "masks/CAMERA)."
+            )
     series = [*firsts.values()][:MAX_SERIES] if len(firsts) > 1 else []
     sizes = {picture_size(file): file for file in series}
     if len(sizes) > 1:

@@ -349,7 +349,8 @@ def open_sound(path: Path) -> Iterator[Any]:
 def read_audio(path: Path) -> NDArray[np.float32] | None:
     """Mono samples ``[N]`` in [-1, 1] at 48 kHz; sample 0 sounds at 0 s of the video's time stamps.
 
-    Where the sound starts later than time 0, silence precedes it. None when the file has no sound.
+    Where the sound starts later than time 0, silence precedes it; gaps in the time stamps become silence, and what
+    comes twice is left out. None when the file has no sound.
 
     Raises:
         CaptureError: the file cannot be read, or is longer than two hours.
@@ -362,10 +363,21 @@ def read_audio(path: Path) -> NDArray[np.float32] | None:
         resampler = av.AudioResampler(format="flt", layout="mono", rate=SAMPLE_RATE)
         parts: list[NDArray[np.float32]] = []
         start_seconds: float | None = None
+        end_seconds = 0.0  # of the samples so far
         try:
             for frame in container.decode(stream):
+                seconds = end_seconds if frame.time is None else float(frame.time)
                 if start_seconds is None:
-                    start_seconds = 0.0 if frame.time is None else float(frame.time)
+                    start_seconds = end_seconds = seconds
+                gap = seconds - end_seconds
+                if gap < -GAP_SECONDS:
+                    continue
+                if gap > GAP_SECONDS:
+                    if seconds > LONGEST_SECONDS:
+                        raise _too_long(path)
+                    parts.append(np.zeros(round(gap * SAMPLE_RATE), np.float32))
+                    end_seconds = seconds
+                end_seconds += frame.samples / frame.sample_rate
                 parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(frame)]
             parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(None)]
         except (av.error.FFmpegError, ValueError) as error:  # The latter where channels or rate change.
@@ -379,5 +391,9 @@ def read_audio(path: Path) -> NDArray[np.float32] | None:
     parts.clear()  # two hours are 1.4 GB
     first = round(start_seconds * SAMPLE_RATE)
     if len(samples) + first > LONGEST_SECONDS * SAMPLE_RATE:
-        raise CaptureError(f"{path} is longer than two hours; cut it to the take.")
+        raise _too_long(path)
     return np.concatenate([np.zeros(first, np.float32), samples]) if first > 0 else samples[-first:]
+
+
+def _too_long(path: Path) -> CaptureError:
+    return CaptureError(f"{path} is longer than two hours; cut it to the take.")

@@ -56,10 +56,14 @@ class Clock:
         return self.offset_seconds + self.rate * stamps
 
 
+NUMBER = re.compile(r"(\d{10,}\.\d+|\d+)")
+"""A number in a name: whole, or a time since 1970 with its decimals, of which ``str`` leaves out the last zeros."""
+
+
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts ``cam2`` before ``cam10``."""
-    parts = [part for part in re.split(r"(\d+)", text) if part]
-    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
+    parts = [part for part in NUMBER.split(text) if part]
+    return tuple((0, int(part.split(".")[0]), part) if part[0].isdecimal() else (1, 0, part) for part in parts)
 
 
 def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
@@ -70,7 +74,7 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     """
     keys = {}
     for name, own in stems.items():
-        unpadded = {stem: re.sub(r"\d+", lambda digits: str(int(digits[0])), stem) for stem in own}
+        unpadded = {stem: NUMBER.sub(lambda found: _unpadded(found[0]), stem) for stem in own}
         keys[name] = unpadded if len({*unpadded.values()}) == len(own) else {stem: stem for stem in own}
     taken = Counter(key for own in keys.values() for key in own.values())
     if len(keys) < 2 or all(any(taken[key] > 1 for key in own.values()) for own in keys.values()):
@@ -88,6 +92,10 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
             first, stems[first][0], other, stems[other][0],
         )  # fmt: skip
     return numbered
+
+
+def _unpadded(number: str) -> str:
+    return number if "." in number else str(int(number))
 
 
 def _running_numbers(stems: Sequence[str]) -> dict[str, str]:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import OPAQUE, reduced_mask
-from structgstream.data.timeline import Clock, measured_rate, paired
+from structgstream.data.timeline import Clock, measured_rate, paired, period_seconds
 from structgstream.data.video_index import (
     BT2020,
     HIGH_RANGE,
@@ -170,17 +170,22 @@ def synchronised(
     return VideoSource(where.name, rig, rate, tracks, stamps, points, apart)
 
 
+MIN_PERIOD = 5e-4
+"""Seconds between two frames, below which time stamps are not of frames; containers round to milliseconds."""
+
+
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:
     """Frames a second of the common timeline by time stamp (``timeline.measured_rate``); None for one frame.
 
     Raises:
-        CaptureError: the frames of a video all have one time.
+        CaptureError: most frames of a video have the time of the one before.
     """
     for track in tracks.values():
-        if len(track.stamps) > 1 and track.stamps[-1] == track.stamps[0]:
+        if len(track.stamps) > 1 and period_seconds(track.seconds) < MIN_PERIOD:
             raise CaptureError(
-                f"The {len(track.stamps)} frames of the video {track.path} all have the same time stamp, so they "
-                "cannot be matched with other cameras; write it again with the time of each frame."
+                f"Most of the {len(track.stamps)} frames of the video {track.path} have the time stamp of the one "
+                "before (files that were joined byte by byte have each twice), so they cannot be matched with other "
+                "cameras; write it again with the time of each frame."
             )
     return measured_rate([*_common_times(tracks, clocks).values()])
 

@@ -48,8 +48,10 @@ TRANSFERS = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 6: "BT.601", 7: "SMPTE
              17: "SMPTE 428", HLG: "HLG"}  # fmt: skip
 PRIMARIES = {1: "BT.709", 4: "BT.470M", 5: "BT.470BG", 6: "SMPTE 170M", 7: "SMPTE 240M", BT2020: "BT.2020",
              11: "DCI-P3", 12: "Display P3"}  # fmt: skip
-MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 8: "YCgCo", 9: "BT.2020",
+MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020",
             10: "BT.2020 constant luminance"}  # fmt: skip
+UNREAD_MATRICES = {8: "YCgCo", 11: "SMPTE 2085", 12: "chromaticity-derived", 13: "chromaticity-derived", 14: "ICtCp",
+                   15: "IPT, as Dolby Vision's profile 5", 16: "YCgCo-R", 17: "YCgCo-R"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class VideoTrack:
     origin: int = 0  # ticks of time 0. AVI states no presentation times; its first frame is at 0
     container: str = ""  # FFmpeg's name of the container
     start: int = 0  # presentation time, in ticks, of the first picture, which may be one that does not decode
+    pixel_aspect: float = 1.0  # how many times as wide as high a stored pixel is to be shown; anamorphic ones are not 1
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -174,7 +177,8 @@ def _scan(path: Path) -> VideoTrack:
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
         colors = stated_colors(path, first)
         keyframes, kind = tuple(sorted(keys)), container.format.name
-        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start)
+        aspect = float(stream.sample_aspect_ratio or 1)
+        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start, aspect)
 
 
 def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:
@@ -254,22 +258,28 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     """What a video states of its colours by one of its frames, in words; None where none decodes.
 
     Raises:
-        CaptureError: a transfer function that is not converted, or wide primaries without any, as log videos have.
+        CaptureError: a transfer function or a matrix that is not converted, or wide primaries without HLG or PQ, as
+            log videos have.
     """
     if frame is None:
         return "no frame decodes"
     transfer, primaries = transfer_of(frame), int(getattr(frame, "color_primaries", UNSPECIFIED))
-    if transfer == UNSPECIFIED and primaries == BT2020:
+    if transfer not in HIGH_RANGE and primaries == BT2020:
         raise CaptureError(
-            f"The video {path} has the primaries of BT.2020 and does not state its transfer function, as log videos "
-            "have it, so its colours are unknown; convert it to BT.709 with the camera maker's conversion, keeping the "
-            "time of each frame, or film in standard range."
+            f"The video {path} has the primaries of BT.2020 and does not state HLG or PQ, as log videos have it, so "
+            "its colours are not those of sRGB; convert it to BT.709 with the camera maker's conversion, keeping the "
+            "time of each frame, or film in BT.709."
         )
     if transfer not in DISPLAY_REFERRED | HIGH_RANGE:
         what = TRANSFERS.get(transfer, f"number {transfer}")
         raise CaptureError(
             f"The video {path} states a transfer function ({what}) that is not read; expected BT.709, sRGB, BT.2020, "
             "HLG or PQ: convert it to BT.709, keeping the time of each frame."
+        )
+    if (unread := UNREAD_MATRICES.get(int(frame.colorspace))) is not None:
+        raise CaptureError(
+            f"The video {path} states a colour matrix ({unread}) that is not read; expected RGB, BT.601, BT.709 or "
+            "BT.2020: convert it to BT.709, keeping the time of each frame."
         )
     matrix = MATRICES.get(int(frame.colorspace), "no matrix stated")
     bounds = {1: "limited range", 2: "full range"}.get(int(frame.color_range), "no range stated")

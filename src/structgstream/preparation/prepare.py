@@ -35,7 +35,7 @@ from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
-from structgstream.errors import CalibrationError, ConfigError
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.owned_folders import own_folder
 from structgstream.pose_check.check import Finding
@@ -403,6 +403,10 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
     return find_calibration(footage.where) or "sfm"
 
 
+SQUARE = 0.01
+"""Share by which pixels may differ from squares: whole numbers of pixels make ratios as 2025:2024."""
+
+
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
     """Refuses options that have no effect, so that their user expects another capture, and those of which only a later
     step would find that they cannot be."""
@@ -410,6 +414,13 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
         raise ConfigError(
             f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
             "pictures; leave out --fps."
+        )
+    wide = next((track for track in footage.tracks.values() if abs(track.pixel_aspect - 1) > SQUARE), None)
+    if wide is not None and isinstance(method, str):
+        raise CaptureError(
+            f"The pixels of the video {wide.path} are {wide.pixel_aspect:.3g} times as wide as high (anamorphic), and "
+            "calibration expects square ones; write it again with square pixels (scale=iw*sar:ih,setsar=1 of FFmpeg), "
+            "keeping the time of each frame, or give a calibration of another tool."
         )
     if options.board_videos is not None and method != "board":
         raise ConfigError(

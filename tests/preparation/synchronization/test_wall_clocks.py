@@ -86,6 +86,17 @@ def test_dropped_frames_of_timecode() -> None:
     assert of_day("00:00:59;29", DROPPED) == pytest.approx(1799 * 1001 / 30000)
 
 
+@pytest.mark.parametrize("rate", [25, 30, 30000 / 1001, 60000 / 1001])
+def test_timecode_counts_at_its_nominal_rate_whatever_rounds_and_shakes_the_stamps(rate: float) -> None:
+    """Matroska has milliseconds, of which most at 29.97 frames a second are 33 apart."""
+    exact = np.arange(300) / rate
+    shaken = exact + np.random.default_rng(0).uniform(-3e-4, 3e-4, 300)
+    expected = of_day("10:00:00:00", exact)
+    assert expected == pytest.approx(36000 * round(rate) / rate)
+    assert of_day("10:00:00:00", exact.round(3)) == pytest.approx(expected)
+    assert of_day("10:00:00:00", shaken) == pytest.approx(expected)
+
+
 def test_other_texts() -> None:
     assert timecode("", STAMPS["a"]) is None
     assert timecode("00:61:00:00", STAMPS["a"]) is None

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from structgstream.data.text_files import Unreadable, number, read_text, reason, whole
-from structgstream.data.timeline import Clock, period_seconds
+from structgstream.data.timeline import Clock, counted_rate, period_seconds
 from structgstream.errors import CaptureError
 from structgstream.geometry import Floats
 
@@ -184,13 +184,17 @@ def timecode(text: str, stamps: Floats) -> Timecode | None:
 
     With a semicolon frames are dropped from the count so that it follows the clock at 29.97 and 59.94 frames a second
     (SMPTE ST 12-1): two, or four, at each minute that is no multiple of ten.
+
+    The rate is a whole number, or 1000/1001 of one: by that which the stamps have, rounded as they are in Matroska,
+    ten hours would be off by minutes.
     """
     match = _TIMECODE.fullmatch(text.strip())
     if match is None:
         return None
     hours, minutes, seconds, frames = (int(match[group]) for group in (1, 2, 3, 5))
-    rate = 1 / period_seconds(stamps)
-    counted = round(rate)
+    measured = counted_rate([stamps]) or 30.0
+    counted = round(measured)
+    rate = min((counted, counted * 1000 / 1001), key=lambda nominal: abs(nominal - measured))
     if frames >= counted or hours > 23 or minutes > 59 or seconds > 59:
         return None
 
