@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import rigid, rotation_matrix
 from structgstream.data.lenses import from_integer_centers
 from structgstream.data.open import open_capture, read_calibrated
 from structgstream.errors import CalibrationError, CaptureError
@@ -153,6 +153,16 @@ def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
     }  # fmt: skip
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     check_opens(tmp_path)
+
+
+def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path, NAMES, frames=2)
+    content = {
+        camera.name: {"K": camera.K.tolist(), "extrinsics": rigid(camera.R, camera.T).T.tolist()} for camera in PINHOLES
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    with pytest.raises(CalibrationError, match=r"'cam00' of .*json: the last row of its pose is not 0, 0, 0, 1"):
+        open_capture(tmp_path)
 
 
 def test_thumbnails_among_the_pictures_are_refused(tmp_path: Path) -> None:

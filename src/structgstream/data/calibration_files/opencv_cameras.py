@@ -157,7 +157,8 @@ def _pose(content: dict[str, Any]) -> np.ndarray:
     """World to camera, ``[4, 4]``."""
     for key in ("pose", "inverse pose"):
         if (matrix := _value(content, key)) is not None:
-            viewmat = rigid(matrix[:3, :3], matrix[:3, 3])
+            viewmat = np.eye(4)
+            viewmat[: len(matrix)] = matrix
             return np.linalg.inv(viewmat) if key == "inverse pose" else viewmat
     rotation, translation = _value(content, "rotation"), _value(content, "translation")
     if rotation is None or translation is None:
