@@ -50,6 +50,17 @@ def test_pictures_with_times(tmp_path: Path, pattern: str) -> None:
     assert all_numbers(source.frames()) == [[(camera, frame) for camera in range(3)] for frame in range(FRAMES)]
 
 
+@pytest.mark.parametrize(
+    ("angles", "expected"), [("x", (40, 40)), ("y", (44, 44)), ("xy", (40, 44)), ("", (41, 41))]
+)  # pixels are square where one axis is stated
+def test_angles_give_the_focal_lengths(tmp_path: Path, angles: str, expected: tuple[float, float]) -> None:
+    spans = {"x": WIDTH / 2 / 40, "y": HEIGHT / 2 / 44}
+    stated = {f"camera_angle_{axis}": 2 * math.atan(spans[axis]) for axis in angles} or {"fl_y": 41}
+    write(tmp_path, "rgb/CAM/FRAME.png", **{"camera_angle_x": None, **stated})
+    found = [camera.K.diagonal()[:2].tolist() for camera in open_capture(tmp_path).rig.cameras.values()]
+    np.testing.assert_allclose(found, [expected] * 3)
+
+
 @pytest.mark.parametrize("fps", [0, -30, float("nan"), "fast"])
 def test_a_rate_that_is_none(tmp_path: Path, fps: object) -> None:
     write(tmp_path, "rgb/CAM/FRAME.png", fps=fps)
@@ -139,7 +150,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         open_transforms(tmp_path)
     file.write_text(whole)
     edit_json(file, lambda content: content.pop("camera_angle_x"))
-    with pytest.raises(CalibrationError, match="no 'camera_angle_x'"):
+    with pytest.raises(CalibrationError, match="no 'fl_x or camera_angle_x'"):
         open_transforms(tmp_path)
     file.write_text(whole)
     (tmp_path / "rgb/cam02_0001.png").unlink()
