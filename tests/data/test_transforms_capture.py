@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.data import transforms
+from structgstream.data.lenses import RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
@@ -169,6 +171,12 @@ def test_lenses_that_are_not_known(tmp_path: Path, change: dict) -> None:
     write(tmp_path, "rgb/CAM_FRAME.png", **change)
     with pytest.raises(CalibrationError, match="which is not known here; expected PINHOLE, SIMPLE_PINHOLE, PERSP"):
         open_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "PERSPECTIVE", None])
+def test_coefficients_count_whatever_the_model_is_called(tmp_path: Path, model: str | None) -> None:
+    write(tmp_path, "rgb/CAM_FRAME.png", camera_model=model, k1=-0.2)
+    assert {camera.lens for camera in transforms.read(transforms.find(tmp_path)).cameras} == {RadialTangential(k1=-0.2)}
 
 
 def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:

@@ -141,9 +141,10 @@ def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
     k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model in FISHEYES:
         return Fisheye(k1, k2, k3, k4)
-    if model in PINHOLES or (model in OPENCVS and not any((k1, k2, k3, k4, p1, p2))):
+    # As nerfstudio and instant-ngp do: coefficients count whatever the name of the model.
+    if model in (*PINHOLES, *OPENCVS) and not any((k1, k2, k3, k4, p1, p2)):
         return Pinhole()
-    if model not in OPENCVS or (k4 and model != "FULL_OPENCV"):
+    if model not in (*PINHOLES, *OPENCVS) or (k4 and model != "FULL_OPENCV"):
         raise CalibrationError(
             f"The camera of {name!r} of {where} is of the model {model}{' with k4' if k4 else ''}, which is not known "
             f"here; expected {', '.join((*PINHOLES, *OPENCVS, *FISHEYES))} (k1, k2, k3, p1, p2)."
