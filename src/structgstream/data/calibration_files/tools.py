@@ -82,7 +82,7 @@ def _anipose_entries(files: tuple[Path, ...]) -> Entries:
 
 
 def _anipose_camera(name: str, table: dict[str, Any]) -> PosedCamera:
-    if "rotation" not in table and "translation" not in table:
+    if all(table.get(key, "null") == "null" for key in ("rotation", "translation")):  # as earlier caliscopes write none
         raise NoPose
     K, dist, fisheye = table["matrix"], table["distortions"], bool(table.get("fisheye"))
     R, T = table["rotation"], table["translation"]
