@@ -221,7 +221,7 @@ def _zju_camera(name: str, row: list[Any]) -> PosedCamera:
 # right, y up, z backward. The sensor counts from its border, so that the top-left pixel's centre is (0.5, 0.5).
 
 SUBPIXELS = 64
-VIDEO_MODELS = ("video", "none")
+VIDEO_MODELS = ("video", "hybrid", "none")  # a hybrid camera films markers and video
 
 
 def _qualisys_entries(files: tuple[Path, ...]) -> Entries:
