@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.calibration import rigid, rotation_matrix
-from structgstream.data.lenses import from_integer_centers
+from structgstream.data.lenses import Fisheye, RadialTangential, from_integer_centers
 from structgstream.data.open import open_capture, read_calibrated
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import (
@@ -154,6 +154,50 @@ def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
     }  # fmt: skip
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     check_opens(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "lens"),
+    [
+        ("distortion_model", "equidistant", Fisheye),
+        ("camera_model", "FISHEYE", Fisheye),
+        ("is_fisheye", True, Fisheye),
+        ("lens", "Kannala-Brandt", Fisheye),
+        ("distortion_type", "1", Fisheye),
+        ("fisheye", "False", RadialTangential),
+        ("distortion_type", "radtan", RadialTangential),
+        ("distortion_model", "plumb_bob", RadialTangential),
+        ("model", "ZCAM E2", RadialTangential),
+        ("model", "omnidirectional", None),
+    ],
+)
+def test_the_lens_model_is_what_a_file_calls_it(
+    tmp_path: Path, key: str, value: object, lens: type[Fisheye] | type[RadialTangential] | None
+) -> None:
+    content = {
+        camera.name: {"K": camera.K.tolist(), "D": [0.1, 0.02, 0.003, 0.001], "R": camera.R.tolist(), "T": [0, 0, 3]}
+        for camera in PINHOLES
+    }
+    for entry in content.values():
+        entry[key] = value
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    if lens is None:
+        with pytest.raises(
+            CalibrationError, match=r"'cam00' of .*\(the lens model omnidirectional, which is not known"
+        ):
+            read_calibrated(tmp_path)
+        return
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    assert {camera.lens for camera in found.cameras} == {lens(0.1, 0.02, 0.003, 0.001)}
+
+
+@pytest.mark.parametrize("content", ["cameras: [a, b, c, d, e, f, g, h, i]", "matrix: [a, b, {c: d}, [e]]"])
+def test_lists_of_words_are_no_matrices(tmp_path: Path, content: str) -> None:
+    """Nine names look like a matrix of nine numbers."""
+    (tmp_path / "take.yaml").write_text(content)
+    calibrated(tmp_path)
+    assert read_calibrated(tmp_path) is not None
 
 
 def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:

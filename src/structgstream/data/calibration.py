@@ -95,8 +95,8 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         K: ``[3, 3]`` intrinsics, pixels.
 
     Raises:
-        CalibrationError: invalid values (see :class:`Camera`), a pose written by columns, or a principal point for a picture of
-            another size.
+        CalibrationError: invalid values (see :class:`Camera`), a pose written by columns, or a principal point for a
+            picture of another size.
     """
     try:
         extrinsics = np.array(viewmat, dtype=np.float64)
@@ -113,8 +113,8 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         ) from None
     if not np.allclose(extrinsics[3], [0, 0, 0, 1], atol=1e-6):
         raise CalibrationError(
-            f"Camera {name!r} of {where}: the last row of its pose is not 0, 0, 0, 1, as of a matrix that is written by "
-            "columns or scaled; expected the translation in the last column."
+            f"Camera {name!r} of {where}: the last row of its pose is not 0, 0, 0, 1, as of a matrix that is written "
+            "by columns or scaled; expected the translation in the last column."
         )
     across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height
     # A wrong picture size moves both ratios the same way; a crop seldom does.
