@@ -410,7 +410,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
         pose[:3, :3], pose[:3, 3] = truth.R, truth.T
         own = opencv_matrix("camera_matrix", truth.K) + opencv_matrix("distortion_vector", truth.dist)
         own += f"distortion_type: 0\nimg_width: {WIDTH}\nimg_height: {HEIGHT}\n"
-        own += opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
+        own += "camera_group: 0\n" + opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
         text += f"camera_{number}:\n" + "".join(f"  {line}\n" for line in own.splitlines())
     (tmp_path / "calibrated_cameras_data.yml").write_text(text)
     found = read_calibrated(tmp_path)
@@ -418,6 +418,10 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
     assert [camera.name for camera in found.cameras] == ["camera_0", "camera_1", "camera_2"]
     for truth, camera in zip(truths(), found.cameras, strict=True):
         np.testing.assert_allclose(camera.viewmat[:3, 3], truth.T, atol=1e-9)
+    file = tmp_path / "calibrated_cameras_data.yml"
+    file.write_text(file.read_text().replace("camera_group: 0", "camera_group: 1", 1))
+    with pytest.raises(CalibrationError, match=r"data\.yml has 2 groups of cameras .*each with a world of its own"):
+        read_calibrated(tmp_path)
 
 
 @pytest.mark.parametrize("written", ["", '"null"'])

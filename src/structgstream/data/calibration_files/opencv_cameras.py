@@ -102,6 +102,11 @@ def _entries(files: tuple[Path, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
             raise CalibrationError(
                 f"Camera {name!r} of {where} cannot be read ({reason(error)}); expected {EXPECTED}."
             ) from None
+        if len(groups := {str(content.get("camera_group", 0)) for content in tables.values()}) > 1:
+            raise CalibrationError(
+                f"{file} has {len(groups)} groups of cameras that saw no board in common, each with a world of its own; "
+                "film the board so that every camera shares it with another, and calibrate again."
+            )
         yield from ((own or name, content) for own, content in tables.items() or {name: {}}.items())
 
 
