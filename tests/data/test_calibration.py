@@ -103,6 +103,12 @@ def test_other_shapes_are_no_pose(turn: object, move: object) -> None:
         rigid(turn, move)  # type: ignore[arg-type]
 
 
+def test_angles_in_degrees_are_no_rotation_vector() -> None:
+    with pytest.raises(ValueError, match="a rotation vector of length 95.5.*more than a turn in radians"):
+        rigid([10.0, -95.0, 0.0], [0, 0, 3])
+    assert np.isfinite(rigid([2 * np.pi, 0, 0], [0, 0, 3])).all()
+
+
 TURNED = Alignment(2.5, rotation_matrix(np.array([0.4, -1.2, 2.0])), np.array([3.0, -1.0, 0.5]))
 
 

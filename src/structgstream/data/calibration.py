@@ -58,10 +58,15 @@ class Calibration:
     it was made."""
 
 
+FULL_TURN = 2 * np.pi + 1e-6
+
+
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
     """The matrix ``[4, 4]`` of a rotation ``[3, 3]``, or a vector ``[3]`` in radians, and a translation ``[3]``."""
     turned, moved = np.array(rotation, dtype=np.float64), np.array(translation, dtype=np.float64).reshape(-1)
     if turned.size == 3:
+        if (length := float(np.linalg.norm(turned))) > FULL_TURN:
+            raise Unreadable(f"a rotation vector of length {length:g}, more than a turn in radians; are these degrees?")
         turned = rotation_matrix(turned.reshape(3))
     elif turned.shape == (9,):
         turned = turned.reshape(3, 3)

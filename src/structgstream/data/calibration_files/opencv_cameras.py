@@ -104,8 +104,8 @@ def _entries(files: tuple[Path, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
             ) from None
         if len(groups := {str(content.get("camera_group", 0)) for content in tables.values()}) > 1:
             raise CalibrationError(
-                f"{file} has {len(groups)} groups of cameras that saw no board in common, each with a world of its own; "
-                "film the board so that every camera shares it with another, and calibrate again."
+                f"{file} has {len(groups)} groups of cameras that saw no board in common, each with a world of its "
+                "own; film the board so that every camera shares it with another, and calibrate again."
             )
         yield from ((own or name, content) for own, content in tables.items() or {name: {}}.items())
 
