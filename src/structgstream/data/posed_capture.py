@@ -96,7 +96,7 @@ def open_posed(
             videos = _posed(videos, calibration, root) if partial else videos
             return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
-            files = _layout(folders, calibration)
+            files = _layout(folders, calibration, root)
             # Else depth maps, for example, next to images/CAMERA.
             if root != path or not stills or _poses(calibration, files):
                 return pictured(root, files, partial=bool(calibration.unposed))
@@ -104,7 +104,7 @@ def open_posed(
         # Structure from motion often leaves out some photos.
         return pictured(stills[0][0], {name: {"0": file} for name, file in stills[0][1].items()}, partial=True)
     for root in other_roots(path, pictures=True):
-        return pictured(root, _layout(pictures_in(root), calibration), partial=bool(calibration.unposed))
+        return pictured(root, _layout(pictures_in(root), calibration, root), partial=bool(calibration.unposed))
     raise NoFrames(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         f"frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4{unread_files(path)}."
@@ -219,22 +219,27 @@ def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> in
     return orientation if calibration.turned_by_exif else 1
 
 
-def _layout(folders: Pictures, calibration: Calibration) -> Pictures:
-    """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras."""
+def _layout(folders: Pictures, calibration: Calibration, root: Path) -> Pictures:
+    """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras.
+
+    Where frames and cameras have the same numbers the name of the folder that holds them decides: ``frames``.
+    """
     per_frame: dict[str, dict[str, Path]] = {}
     for folder, pictures in folders.items():
         for stem, file in pictures.items() if re.search(r"\d", folder) else ():  # frames have numbers
             per_frame.setdefault(stem, {})[folder] = file
-    found: list[tuple[int, Pictures]] = []
+    found: list[tuple[tuple[bool, int], Pictures]] = []  # whether all have a pose, and how many
     reasons: list[CalibrationError] = []
     names = [_parts(posed.name) for posed in calibration.cameras]
     in_frames = any(len(parts) == 1 or not folders.keys().isdisjoint(parts[:-1]) for parts in names)
-    for files in (folders, per_frame) if in_frames else (folders,):
+    layouts = (per_frame, folders) if root.name.lower() == "frames" else (folders, per_frame)
+    for files in layouts if in_frames else (folders,):
         try:
-            found.append((len(_poses(calibration, files)), files))
+            count = len(_poses(calibration, files))
+            found.append(((count == len(files), count), files))
         except CalibrationError as error:
             reasons.append(error)
-    count, files = max(found, key=lambda candidate: candidate[0], default=(0, folders))
+    (_, count), files = max(found, key=lambda candidate: candidate[0], default=((False, 0), folders))
     if not count and reasons:
         raise reasons[0]
     return files if count else folders
