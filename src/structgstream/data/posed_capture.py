@@ -88,8 +88,7 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
-    known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
-    stills = [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
+    stills = stills_of(path)
     for root in chain(filmed_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
@@ -109,6 +108,12 @@ def open_posed(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         f"frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4{unread_files(path)}."
     )
+
+
+def stills_of(path: Path) -> list[tuple[Path, dict[str, Path]]]:
+    """Folders of one picture a camera, in order, with these by name."""
+    known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
+    return [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
 
 
 class NoFrames(CaptureError):
