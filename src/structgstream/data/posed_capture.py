@@ -56,6 +56,9 @@ from structgstream.errors import CalibrationError, CaptureError
 log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures do not state a rate
+OFF_CENTER, NEARLY_SAME = 0.08, 0.1
+"""How far principal points lie off the middle, on average, and by how much sizes differ, both as shares, where a
+calibration is hardly for these pictures."""
 STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estimated poses of one camera may differ
 
 Of = TypeVar("Of")
@@ -349,7 +352,34 @@ def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibra
         width, height = posed.size or size
         camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
         filmed[name] = LensCamera(at_picture_size(camera, size, name=name, where=where), posed.lens)
+    _warn_of_sizes(filmed, poses, where)
     return filmed
+
+
+def _warn_of_sizes(filmed: Mapping[str, LensCamera], poses: Mapping[str, PosedCamera], where: Path) -> None:
+    """Warns of pictures that a calibration may not be for, though their proportions are right."""
+    cameras = {name: own.camera for name, own in filmed.items()}
+    middles = [
+        (camera.K[:2, 2] / camera.K.new_tensor([camera.width, camera.height])).tolist()
+        for name, camera in cameras.items()
+        if poses[name].size is None
+    ]
+    middle = np.mean(middles or [[0.5, 0.5]], 0)
+    if middle.max() < 0.5 - OFF_CENTER or middle.min() > 0.5 + OFF_CENTER:
+        log.warning(
+            "%s states no size of pictures, and its principal points lie at %.0f %% of their width and %.0f %% of "
+            "their height: it may be for pictures of another size; use those, or scale its intrinsics",
+            where, *(100 * middle),
+        )  # fmt: skip
+    for name, camera in cameras.items():
+        size = poses[name].size or (camera.width, camera.height)
+        if camera.width != size[0] and abs(camera.width / size[0] - 1) < NEARLY_SAME:
+            log.warning(
+                "%s is for pictures of %dx%d pixels, those of camera %r have %dx%d, hardly another size: one may be of "
+                "undistorted pictures (colmap image_undistorter), the other of those as filmed; use both of one kind",
+                where, *size, name, camera.width, camera.height,
+            )  # fmt: skip
+            return
 
 
 def _rig(
