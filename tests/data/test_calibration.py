@@ -17,6 +17,7 @@ from structgstream.data.calibration import (
     PosedCamera,
     alignment,
     calibrated_camera,
+    calibrated_rig,
     listed,
     rigid,
     rotation_matrix,
@@ -66,6 +67,17 @@ def test_intrinsics_of_another_picture_size_are_refused(width: int, height: int)
 
 def test_a_principal_point_off_centre_is_accepted() -> None:
     assert camera(intrinsics=K + np.array([[0, 0, 14], [0, 0, -2], [0, 0, 0]])).K[0, 2] == 46
+
+
+@pytest.mark.parametrize(
+    ("moved", "words"),
+    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "all training cameras stand at one place")],
+)
+def test_cameras_without_poses_of_their_own_are_refused(moved: tuple[float, float], words: str) -> None:
+    """Tools write zeros for what they did not calibrate."""
+    rig = {name: camera(rigid([0, angle, 0], [0, 0, 0]), K) for name, angle in zip("ab", moved, strict=True)}
+    with pytest.raises(CalibrationError, match=f"{WHERE}: .*{words}"):
+        calibrated_rig(rig, (), where=WHERE)
 
 
 def test_long_lists_are_cut() -> None:

@@ -154,6 +154,8 @@ def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
     }  # fmt: skip
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     check_opens(tmp_path)
+    (tmp_path / "calibration.json").write_text(json.dumps({"cameras": list(content.values())}))  # without names
+    check_opens(tmp_path)
 
 
 @pytest.mark.parametrize(

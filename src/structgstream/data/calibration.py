@@ -154,12 +154,25 @@ def calibrated_rig(
     """The rig of a capture; ``near`` (capture units) defaults to 0.12 times the rig's radius.
 
     Raises:
-        CalibrationError: fewer than two training cameras, or an unknown held-out one, naming ``where``.
+        CalibrationError: fewer than two training cameras, an unknown held-out one, two cameras of one pose, or all at
+            one place, naming ``where``.
     """
     try:
         rig = CameraRig(dict(cameras), frozenset(held_out))
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
+    named: dict[bytes, str] = {}  # by pose
+    for name, camera in cameras.items():
+        if (other := named.setdefault((camera.viewmat.numpy() + 0.0).tobytes(), name)) != name:
+            raise CalibrationError(
+                f"{where}: cameras {other!r} and {name!r} have the same pose, as of cameras whose lenses alone were "
+                "calibrated; calibrate where they stand, or leave one out."
+            )
+    if rig_radius(rig) == 0:
+        raise CalibrationError(
+            f"{where}: all training cameras stand at one place, from which no depth can be seen; expected the pose of "
+            "each, with its translation."
+        )
     return with_near(rig, NEAR_IN_RIG_RADII * rig_radius(rig) if near is None else near)
 
 

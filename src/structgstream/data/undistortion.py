@@ -34,7 +34,8 @@ SKEW_PIXELS = 0.1  # by which rows may be shifted in a picture that is taken for
 def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple[int, int] | None = None) -> Camera:
     """The pinhole that pictures of a lens can be resampled for, with square pixels.
 
-    Without distortion and skew (which no other module knows) the camera itself, unless ``degrees`` or ``size`` is given.
+    Without distortion and skew, of which no other module knows, the camera itself, unless ``degrees`` or ``size`` is
+    given.
 
     Args:
         degrees: field of view across the picture's width, around the optical axis; None for the largest that the lens

@@ -120,7 +120,8 @@ def _tables(file: Path) -> dict[str, dict[str, Any]]:
         if isinstance(group, dict):
             named += group.items()
         elif isinstance(group, list):
-            named += ((_value(one, "name"), one) for one in group if isinstance(one, dict))
+            listed = enumerate(one for one in group if isinstance(one, dict))
+            named += ((index if (name := _value(one, "name")) is None else name, one) for index, one in listed)
     split = ((str(key), _with_intrinsics(one)) for key, one in named if isinstance(one, dict))
     return {key: one for key, one in split if _value(one, "K") is not None}
 
