@@ -124,6 +124,12 @@ def test_one_instant_serves_for_all(tmp_path: Path) -> None:
     assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
 
 
+def test_masks_of_nerfstudio_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png", mask_path="masks/0.png")
+    open_transforms(tmp_path)
+    assert "the pictures of mask_path are not read; masks lie in masks/CAMERA.png" in caplog.text
+
+
 def test_videos(tmp_path: Path) -> None:
     write_videos(tmp_path, [camera.name for camera in CAMERAS], frames=FRAMES)
     write_transforms(tmp_path, CAMERAS, pattern="NAME.mp4")

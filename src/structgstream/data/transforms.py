@@ -84,6 +84,10 @@ def _shots_of(file: Path) -> list[Shot]:
         content = mapping(read_json(file))
         frames = [{**content, **mapping(frame)} for frame in content["frames"]]
         entries = [(str(frame["file_path"]), frame) for frame in frames]
+    if any(frame.get("mask_path") for frame in frames):
+        log.warning(
+            "%s: the pictures of mask_path are not read; masks lie in masks/CAMERA.png, black does not count", file
+        )
     pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
     taken: list[tuple[Path, float | None]] = []
 
