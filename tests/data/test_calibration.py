@@ -71,7 +71,7 @@ def test_a_principal_point_off_centre_is_accepted() -> None:
 
 @pytest.mark.parametrize(
     ("moved", "words"),
-    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "all training cameras stand at one place")],
+    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "all cameras stand at one place")],
 )
 def test_cameras_without_poses_of_their_own_are_refused(moved: tuple[float, float], words: str) -> None:
     """Tools write zeros for what they did not calibrate."""

@@ -58,7 +58,7 @@ class Calibration:
     it was made."""
 
 
-FULL_TURN = 2 * np.pi + 1e-6
+FULL_TURN = 2 * np.pi + 1e-6  # radians; optimised vectors exceed half a turn
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
@@ -154,13 +154,23 @@ def calibrated_rig(
     """The rig of a capture; ``near`` (capture units) defaults to 0.12 times the rig's radius.
 
     Raises:
-        CalibrationError: fewer than two training cameras, an unknown held-out one, two cameras of one pose, or all at
-            one place, naming ``where``.
+        CalibrationError: fewer than two training cameras, an unknown held-out one, or cameras without poses of their
+            own, naming ``where``.
     """
     try:
         rig = CameraRig(dict(cameras), frozenset(held_out))
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
+    check_poses(cameras, where=where)
+    return with_near(rig, NEAR_IN_RIG_RADII * rig_radius(rig) if near is None else near)
+
+
+def check_poses(cameras: Mapping[str, Camera], *, where: Path) -> None:
+    """Check that every camera has a pose of its own; tools write zeros for what they did not calibrate.
+
+    Raises:
+        CalibrationError: two have the same pose, or all stand at one place, naming ``where``.
+    """
     named: dict[bytes, str] = {}  # by pose
     for name, camera in cameras.items():
         if (other := named.setdefault((camera.viewmat.numpy() + 0.0).tobytes(), name)) != name:
@@ -168,12 +178,11 @@ def calibrated_rig(
                 f"{where}: cameras {other!r} and {name!r} have the same pose, as of cameras whose lenses alone were "
                 "calibrated; calibrate where they stand, or leave one out."
             )
-    if rig_radius(rig) == 0:
+    if len(cameras) > 1 and len({tuple(camera.center.tolist()) for camera in cameras.values()}) == 1:
         raise CalibrationError(
-            f"{where}: all training cameras stand at one place, from which no depth can be seen; expected the pose of "
-            "each, with its translation."
+            f"{where}: all cameras stand at one place, from which no depth can be seen; expected each with its own "
+            "translation."
         )
-    return with_near(rig, NEAR_IN_RIG_RADII * rig_radius(rig) if near is None else near)
 
 
 def with_near(rig: CameraRig, near: float) -> CameraRig:

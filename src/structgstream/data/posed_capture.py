@@ -24,6 +24,7 @@ from structgstream.data.calibration import (
     calibrated_rig,
     check_held_out,
     check_names,
+    check_poses,
     listed,
 )
 from structgstream.data.camera_files import (
@@ -396,8 +397,11 @@ def filmed_by(calibration: Calibration, sizes: Sizes, *, root: Path) -> dict[str
     """The cameras of a calibration with their lenses, for pictures in ``root`` of ``sizes``, width and height.
 
     Raises:
-        CalibrationError: it is of other cameras, of one that moves, or for pictures of other proportions.
+        CalibrationError: it is of other cameras, of one that moves, cameras of one pose, or for pictures of
+            other proportions.
     """
     poses = _poses(calibration, sizes)
     _check(poses, sizes, calibration=calibration, root=root)
-    return _filmed(poses, sizes, calibration)
+    filmed = _filmed(poses, sizes, calibration)
+    check_poses({name: own.camera for name, own in filmed.items()}, where=calibration.where)
+    return filmed

@@ -44,7 +44,7 @@ FILLING = re.compile(
     r"param(eter)?s?|s$"
 )
 FISHEYES = re.compile(r"fish|equidist|\bequi\b|kannala")
-OTHER_LENSES = re.compile(r"omni|unified|ucm|double|division|equirect")
+OTHER_LENSES = re.compile(r"omni(?!vision)|unified|ucm|double.?sphere|division|equirect")
 """Words in the names of lens models: of OpenCV's fisheye, and of those that are not known here. Others are OpenCV's or
 names of products."""
 SHAPES = {
