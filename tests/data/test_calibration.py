@@ -17,6 +17,7 @@ from structgstream.data.calibration import (
     PosedCamera,
     alignment,
     calibrated_camera,
+    calibrated_rig,
     listed,
     rigid,
     rotation_matrix,
@@ -45,6 +46,8 @@ def test_three_rows_of_a_pose_are_enough() -> None:
         (np.eye(4), K * [[np.nan], [1], [1]], "not finite"),
         (np.eye(4) * 2, K, "orthonormal"),
         (np.diag([1, 1, -1, 1]), K, "orthonormal"),
+        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0.2, 3, 1]], K, "last row .* written by columns"),
+        (np.diag([1, 1, 1, 2]), K, "last row"),
         (np.eye(3), K, "4x4"),
         ([[1, 2], [3]], K, "cannot be read"),
         ("what", K, "cannot be read"),
@@ -64,6 +67,17 @@ def test_intrinsics_of_another_picture_size_are_refused(width: int, height: int)
 
 def test_a_principal_point_off_centre_is_accepted() -> None:
     assert camera(intrinsics=K + np.array([[0, 0, 14], [0, 0, -2], [0, 0, 0]])).K[0, 2] == 46
+
+
+@pytest.mark.parametrize(
+    ("moved", "words"),
+    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "all cameras stand at one place")],
+)
+def test_cameras_without_poses_of_their_own_are_refused(moved: tuple[float, float], words: str) -> None:
+    """Tools write zeros for what they did not calibrate."""
+    rig = {name: camera(rigid([0, angle, 0], [0, 0, 0]), K) for name, angle in zip("ab", moved, strict=True)}
+    with pytest.raises(CalibrationError, match=f"{WHERE}: .*{words}"):
+        calibrated_rig(rig, (), where=WHERE)
 
 
 def test_long_lists_are_cut() -> None:
@@ -99,6 +113,12 @@ def test_a_pose_takes_a_vector_or_a_matrix(vector: tuple[float, ...], moved: tup
 def test_other_shapes_are_no_pose(turn: object, move: object) -> None:
     with pytest.raises(ValueError, match="a rotation of shape"):
         rigid(turn, move)  # type: ignore[arg-type]
+
+
+def test_angles_in_degrees_are_no_rotation_vector() -> None:
+    with pytest.raises(ValueError, match="a rotation vector of length 95.5.*more than a turn in radians"):
+        rigid([10.0, -95.0, 0.0], [0, 0, 3])
+    assert np.isfinite(rigid([2 * np.pi, 0, 0], [0, 0, 3])).all()
 
 
 TURNED = Alignment(2.5, rotation_matrix(np.array([0.4, -1.2, 2.0])), np.array([3.0, -1.0, 0.5]))

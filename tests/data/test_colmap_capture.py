@@ -51,6 +51,16 @@ def test_folders_per_camera_and_per_frame(tmp_path: Path, pattern: str, names: l
     assert all_numbers(source.frames(2)) == EXPECTED[2:]
 
 
+@pytest.mark.parametrize(("root", "frames"), [("frames", 3), ("frames", 4), ("images", 4)])
+def test_frames_and_cameras_of_the_same_numbers(tmp_path: Path, root: str, frames: int) -> None:
+    """``frames`` holds frames; elsewhere the layout in which every folder and picture has a pose is taken."""
+    for camera in range(3):
+        for frame in range(frames):
+            write_picture(tmp_path / f"{root}/{frame}/{camera}.png", picture(camera, frame))
+    write_text_model(tmp_path / "sparse/0", RIG, [(f"{camera}.png", name) for camera, name in enumerate(RIG)])
+    assert all_numbers(open_capture(tmp_path).frames()) == EXPECTED[:frames]
+
+
 @pytest.mark.parametrize("folder", ["", "videos"])
 def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
     write_videos(tmp_path / folder, list(RIG), frames=FRAMES)

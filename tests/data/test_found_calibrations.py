@@ -3,6 +3,7 @@
 
 import json
 import logging
+import re
 import shutil
 import unicodedata
 from collections.abc import Callable
@@ -13,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.calibration import rotation_matrix
-from structgstream.data.lenses import from_integer_centers
+from structgstream.data.calibration import rigid, rotation_matrix
+from structgstream.data.lenses import Fisheye, RadialTangential, from_integer_centers
 from structgstream.data.open import open_capture, read_calibrated
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import (
@@ -153,6 +154,62 @@ def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
     }  # fmt: skip
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     check_opens(tmp_path)
+    (tmp_path / "calibration.json").write_text(json.dumps({"cameras": list(content.values())}))  # without names
+    check_opens(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "lens"),
+    [
+        ("distortion_model", "equidistant", Fisheye),
+        ("camera_model", "FISHEYE", Fisheye),
+        ("is_fisheye", True, Fisheye),
+        ("lens", "Kannala-Brandt", Fisheye),
+        ("distortion_type", "1", Fisheye),
+        ("fisheye", "False", RadialTangential),
+        ("distortion_type", "radtan", RadialTangential),
+        ("distortion_model", "plumb_bob", RadialTangential),
+        ("model", "ZCAM E2", RadialTangential),
+        ("model", "omnidirectional", None),
+    ],
+)
+def test_the_lens_model_is_what_a_file_calls_it(
+    tmp_path: Path, key: str, value: object, lens: type[Fisheye] | type[RadialTangential] | None
+) -> None:
+    content = {
+        camera.name: {"K": camera.K.tolist(), "D": [0.1, 0.02, 0.003, 0.001], "R": camera.R.tolist(), "T": [0, 0, 3]}
+        for camera in PINHOLES
+    }
+    for entry in content.values():
+        entry[key] = value
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    if lens is None:
+        with pytest.raises(
+            CalibrationError, match=r"'cam00' of .*\(the lens model omnidirectional, which is not known"
+        ):
+            read_calibrated(tmp_path)
+        return
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    assert {camera.lens for camera in found.cameras} == {lens(0.1, 0.02, 0.003, 0.001)}
+
+
+@pytest.mark.parametrize("content", ["cameras: [a, b, c, d, e, f, g, h, i]", "matrix: [a, b, {c: d}, [e]]"])
+def test_lists_of_words_are_no_matrices(tmp_path: Path, content: str) -> None:
+    """Nine names look like a matrix of nine numbers."""
+    (tmp_path / "take.yaml").write_text(content)
+    calibrated(tmp_path)
+    assert read_calibrated(tmp_path) is not None
+
+
+def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path, NAMES, frames=2)
+    content = {
+        camera.name: {"K": camera.K.tolist(), "extrinsics": rigid(camera.R, camera.T).T.tolist()} for camera in PINHOLES
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    with pytest.raises(CalibrationError, match=r"'cam00' of .*json: the last row of its pose is not 0, 0, 0, 1"):
+        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -365,7 +422,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
         pose[:3, :3], pose[:3, 3] = truth.R, truth.T
         own = opencv_matrix("camera_matrix", truth.K) + opencv_matrix("distortion_vector", truth.dist)
         own += f"distortion_type: 0\nimg_width: {WIDTH}\nimg_height: {HEIGHT}\n"
-        own += opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
+        own += "camera_group: 0\n" + opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
         text += f"camera_{number}:\n" + "".join(f"  {line}\n" for line in own.splitlines())
     (tmp_path / "calibrated_cameras_data.yml").write_text(text)
     found = read_calibrated(tmp_path)
@@ -373,13 +430,20 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
     assert [camera.name for camera in found.cameras] == ["camera_0", "camera_1", "camera_2"]
     for truth, camera in zip(truths(), found.cameras, strict=True):
         np.testing.assert_allclose(camera.viewmat[:3, 3], truth.T, atol=1e-9)
+    file = tmp_path / "calibrated_cameras_data.yml"
+    file.write_text(file.read_text().replace("camera_group: 0", "camera_group: 1", 1))
+    with pytest.raises(CalibrationError, match=r"data\.yml has 2 groups of cameras .*each with a world of its own"):
+        read_calibrated(tmp_path)
 
 
-def test_a_camera_without_a_pose_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("written", ["", '"null"'])
+def test_a_camera_without_a_pose_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture, written: str) -> None:
+    """Earlier versions of caliscope write what there is not as text."""
     write_videos(tmp_path, NAMES, frames=2)
     file = write_anipose(tmp_path, truths(dist=(0, 0, 0, 0)))
     tables = file.read_text().split("\n\n")
-    tables[2] = "\n".join(line for line in tables[2].split("\n") if not line.startswith(("rotation", "translation")))
+    for key in ("rotation", "translation"):
+        tables[2] = re.sub(rf"^{key} =.*\n", f"{key} = {written}\n" if written else "", tables[2], flags=re.MULTILINE)
     file.write_text("\n\n".join(tables))
     with caplog.at_level(logging.WARNING):
         check_opens(tmp_path, names=NAMES[:2])

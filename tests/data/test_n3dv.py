@@ -173,6 +173,18 @@ def test_decoded_pictures(tmp_path: Path) -> None:
     assert all_numbers(source.frames(1)) == [[(camera, 1) for camera in range(4)]]
 
 
+def test_one_picture_a_camera(tmp_path: Path) -> None:
+    """As LLFF and mip-NeRF 360 are published, with reduced copies."""
+    rig = write_n3dv(tmp_path)
+    for camera, name in enumerate(rig):
+        (tmp_path / f"{name}.mp4").unlink()
+        for folder in ("images", "images_4"):
+            write_picture(tmp_path / folder / f"{name}.JPG", picture(camera, 0))
+    source = open_n3dv(tmp_path)
+    assert all_numbers(source.frames()) == [[(camera, 0) for camera in range(4)]]
+    torch.testing.assert_close(source.rig["cam03"].viewmat, rig["cam03"].viewmat)
+
+
 def test_pictures_of_the_held_out_camera_alone(tmp_path: Path) -> None:
     np.save(tmp_path / "poses_bounds.npy", np.array([[0, 1, 0, 0, 48, 1, 0, 0, 0, 64, 0, 0, -1, 0, 60, 1, 10]], float))
     write_picture(tmp_path / "cam00/images/0000.png", picture(0, 0))

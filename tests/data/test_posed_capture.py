@@ -91,6 +91,27 @@ def test_a_calibration_without_sizes_is_of_the_pictures() -> None:
     np.testing.assert_allclose(found["cam1"].camera.K, given.cameras[1].K)
 
 
+@pytest.mark.parametrize(("factor", "warns"), [(1, False), (0.75, True), (1.5, True)])
+def test_principal_points_tell_the_size_that_is_not_stated(
+    factor: float, warns: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Within what is refused for one camera, whose picture may be a crop."""
+    given = calibration(("cam0", "cam1", "cam2"), size=None)
+    size = round(WIDTH * factor), round(HEIGHT * factor)
+    filmed_by(given, {own.name: size for own in given.cameras}, root=ROOT)
+    assert ("states no size of pictures, and its principal points lie at" in caplog.text) is warns
+
+
+@pytest.mark.parametrize(("width", "warns"), [(400, False), (408, True), (800, False)])
+def test_pictures_of_nearly_the_size_may_be_distorted(
+    width: int, warns: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    given = calibration(("cam0", "cam1", "cam2"), size=(400, 300))
+    given = replace(given, cameras=tuple(replace(own, K=own.K * [[6.25], [6.25], [1]]) for own in given.cameras))
+    filmed_by(given, {own.name: (width, width * 3 // 4) for own in given.cameras}, root=ROOT)
+    assert ("is for pictures of 400x300 pixels, those of camera 'cam0' have 408x306" in caplog.text) is warns
+
+
 def test_a_crop_is_no_reduction() -> None:
     given = calibration(("cam0", "cam1", "cam2"))
     sizes = {own.name: (WIDTH, HEIGHT) for own in given.cameras} | {"cam1": (WIDTH, HEIGHT - 6)}

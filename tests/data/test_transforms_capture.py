@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.data import transforms
+from structgstream.data.lenses import RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
@@ -48,6 +50,17 @@ def test_pictures_with_times(tmp_path: Path, pattern: str) -> None:
         expected = [[40.0, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]]
         torch.testing.assert_close(source.rig[name].K, torch.tensor(expected, dtype=torch.float64))
     assert all_numbers(source.frames()) == [[(camera, frame) for camera in range(3)] for frame in range(FRAMES)]
+
+
+@pytest.mark.parametrize(
+    ("angles", "expected"), [("x", (40, 40)), ("y", (44, 44)), ("xy", (40, 44)), ("", (41, 41))]
+)  # pixels are square where one axis is stated
+def test_angles_give_the_focal_lengths(tmp_path: Path, angles: str, expected: tuple[float, float]) -> None:
+    spans = {"x": WIDTH / 2 / 40, "y": HEIGHT / 2 / 44}
+    stated = {f"camera_angle_{axis}": 2 * math.atan(spans[axis]) for axis in angles} or {"fl_y": 41}
+    write(tmp_path, "rgb/CAM/FRAME.png", **{"camera_angle_x": None, **stated})
+    found = [camera.K.diagonal()[:2].tolist() for camera in open_capture(tmp_path).rig.cameras.values()]
+    np.testing.assert_allclose(found, [expected] * 3)
 
 
 @pytest.mark.parametrize("fps", [0, -30, float("nan"), "fast"])
@@ -111,6 +124,12 @@ def test_one_instant_serves_for_all(tmp_path: Path) -> None:
     assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
 
 
+def test_masks_of_nerfstudio_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png", mask_path="masks/0.png")
+    open_transforms(tmp_path)
+    assert "the pictures of mask_path are not read; masks lie in masks/CAMERA.png" in caplog.text
+
+
 def test_videos(tmp_path: Path) -> None:
     write_videos(tmp_path, [camera.name for camera in CAMERAS], frames=FRAMES)
     write_transforms(tmp_path, CAMERAS, pattern="NAME.mp4")
@@ -139,7 +158,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         open_transforms(tmp_path)
     file.write_text(whole)
     edit_json(file, lambda content: content.pop("camera_angle_x"))
-    with pytest.raises(CalibrationError, match="no 'camera_angle_x'"):
+    with pytest.raises(CalibrationError, match="no 'fl_x or camera_angle_x'"):
         open_transforms(tmp_path)
     file.write_text(whole)
     (tmp_path / "rgb/cam02_0001.png").unlink()
@@ -158,6 +177,12 @@ def test_lenses_that_are_not_known(tmp_path: Path, change: dict) -> None:
     write(tmp_path, "rgb/CAM_FRAME.png", **change)
     with pytest.raises(CalibrationError, match="which is not known here; expected PINHOLE, SIMPLE_PINHOLE, PERSP"):
         open_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "PERSPECTIVE", None])
+def test_coefficients_count_whatever_the_model_is_called(tmp_path: Path, model: str | None) -> None:
+    write(tmp_path, "rgb/CAM_FRAME.png", camera_model=model, k1=-0.2)
+    assert {camera.lens for camera in transforms.read(transforms.find(tmp_path)).cameras} == {RadialTangential(k1=-0.2)}
 
 
 def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:

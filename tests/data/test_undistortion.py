@@ -225,6 +225,20 @@ def test_a_pinhole_stays_as_it_is() -> None:
     assert torch.equal(half.K, camera.camera.resized(160, 120).K)
 
 
+def test_skew_is_taken_out_of_the_pictures() -> None:
+    """Projection matrices of direct linear transforms have some; what is drawn has none."""
+    straight = filmed(Pinhole())
+    K = straight.camera.K.clone()
+    K[0, 1] = 6.0
+    camera = replace(straight, camera=replace(straight.camera, K=K))
+    target = rectilinear(camera)
+    assert target.K[0, 1] == 0
+    taken = pattern(camera.to_normalized(centers(camera.camera)))
+    assert np.abs(Undistortion(camera, target)(taken).astype(float) - expected(target)).mean() < 0.35
+    K[0, 1] = 1e-3
+    assert torch.equal(rectilinear(replace(camera, camera=replace(camera.camera, K=K))).K, K)
+
+
 def test_what_cannot_be_made_is_refused() -> None:
     with pytest.raises(ConfigError, match="cannot show 180 degrees"):
         rectilinear(filmed(WIDE), degrees=180)

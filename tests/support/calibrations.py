@@ -99,7 +99,7 @@ def write_multical(folder: Path, cameras: Sequence[Truth]) -> Path:
             "model": "standard",
             "image_size": [WIDTH, HEIGHT],
             "K": camera.K.tolist(),
-            "dist": [list(camera.dist)],
+            "dist": [[value] for value in camera.dist] if camera.fisheye else [list(camera.dist)],
         }
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = camera.R, camera.T

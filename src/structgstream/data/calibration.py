@@ -58,10 +58,15 @@ class Calibration:
     it was made."""
 
 
+FULL_TURN = 2 * np.pi + 1e-6  # radians; optimised vectors exceed half a turn
+
+
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
     """The matrix ``[4, 4]`` of a rotation ``[3, 3]``, or a vector ``[3]`` in radians, and a translation ``[3]``."""
     turned, moved = np.array(rotation, dtype=np.float64), np.array(translation, dtype=np.float64).reshape(-1)
     if turned.size == 3:
+        if (length := float(np.linalg.norm(turned))) > FULL_TURN:
+            raise Unreadable(f"a rotation vector of length {length:g}, more than a turn in radians; are these degrees?")
         turned = rotation_matrix(turned.reshape(3))
     elif turned.shape == (9,):
         turned = turned.reshape(3, 3)
@@ -95,7 +100,8 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         K: ``[3, 3]`` intrinsics, pixels.
 
     Raises:
-        CalibrationError: invalid values (see :class:`Camera`), or a principal point for a picture of another size.
+        CalibrationError: invalid values (see :class:`Camera`), a pose written by columns, or a principal point for a
+            picture of another size.
     """
     try:
         extrinsics = np.array(viewmat, dtype=np.float64)
@@ -110,6 +116,11 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
             f"Camera {name!r} of {where} has a matrix that cannot be read ({reason(error)}); "
             "expected rows of numbers, a 3x3 K and a 4x4 pose."
         ) from None
+    if not np.allclose(extrinsics[3], [0, 0, 0, 1], atol=1e-6):
+        raise CalibrationError(
+            f"Camera {name!r} of {where}: the last row of its pose is not 0, 0, 0, 1, as of a matrix that is written "
+            "by columns or scaled; expected the translation in the last column."
+        )
     across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height
     # A wrong picture size moves both ratios the same way; a crop seldom does.
     if not (0 < across < 1 and 0 < down < 1) or max(across, down) < 0.3 or min(across, down) > 0.7:
@@ -143,13 +154,35 @@ def calibrated_rig(
     """The rig of a capture; ``near`` (capture units) defaults to 0.12 times the rig's radius.
 
     Raises:
-        CalibrationError: fewer than two training cameras, or an unknown held-out one, naming ``where``.
+        CalibrationError: fewer than two training cameras, an unknown held-out one, or cameras without poses of their
+            own, naming ``where``.
     """
     try:
         rig = CameraRig(dict(cameras), frozenset(held_out))
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
+    check_poses(cameras, where=where)
     return with_near(rig, NEAR_IN_RIG_RADII * rig_radius(rig) if near is None else near)
+
+
+def check_poses(cameras: Mapping[str, Camera], *, where: Path) -> None:
+    """Check that every camera has a pose of its own; tools write zeros for what they did not calibrate.
+
+    Raises:
+        CalibrationError: two have the same pose, or all stand at one place, naming ``where``.
+    """
+    named: dict[bytes, str] = {}  # by pose
+    for name, camera in cameras.items():
+        if (other := named.setdefault((camera.viewmat.numpy() + 0.0).tobytes(), name)) != name:
+            raise CalibrationError(
+                f"{where}: cameras {other!r} and {name!r} have the same pose, as of cameras whose lenses alone were "
+                "calibrated; calibrate where they stand, or leave one out."
+            )
+    if len(cameras) > 1 and len({tuple(camera.center.tolist()) for camera in cameras.values()}) == 1:
+        raise CalibrationError(
+            f"{where}: all cameras stand at one place, from which no depth can be seen; expected each with its own "
+            "translation."
+        )
 
 
 def with_near(rig: CameraRig, near: float) -> CameraRig:

@@ -63,7 +63,7 @@ from structgstream.data.colmap import find_model, read_model
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
 from structgstream.data.matching import PairMatcher, confirmed_share
-from structgstream.data.posed_capture import of_pictures, of_videos, open_posed
+from structgstream.data.posed_capture import of_pictures, of_videos, open_posed, stills_of
 from structgstream.data.source import FrameSource, resized
 from structgstream.data.text_files import (
     NamedFiles,
@@ -204,11 +204,13 @@ def open_n3dv(path: Path) -> FrameSource:
     poses = _read_llff_poses(path / POSES)
     videos = next(filter(None, map(videos_in, roots_of(path))), {})
     pictures = {} if videos else next(filter(None, map(pictures_in, roots_of(path))), {})
+    if not videos and not pictures and (stills := stills_of(path)):  # of LLFF and mip-NeRF 360
+        pictures = {name: {"0": file} for name, file in stills[0][1].items()}
     names = sorted(videos or pictures, key=natural)
     if len(names) != len(poses):
         raise CalibrationError(
             f"{path / POSES} has {len(poses)} poses, {path} has {len(names)} {'videos' if videos else 'cameras'}; "
-            "expected one pose per camera, in sorted order."
+            "expected a video, a folder of pictures or a picture per pose, in sorted order."
         )
 
     def opened(names: Sequence[str]) -> FrameSource:

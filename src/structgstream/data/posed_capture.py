@@ -24,6 +24,7 @@ from structgstream.data.calibration import (
     calibrated_rig,
     check_held_out,
     check_names,
+    check_poses,
     listed,
 )
 from structgstream.data.camera_files import (
@@ -56,6 +57,9 @@ from structgstream.errors import CalibrationError, CaptureError
 log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures do not state a rate
+OFF_CENTER, NEARLY_SAME = 0.08, 0.1
+"""How far principal points lie off the middle, on average, and by how much sizes differ, both as shares, where a
+calibration is hardly for these pictures."""
 STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estimated poses of one camera may differ
 
 Of = TypeVar("Of")
@@ -88,15 +92,14 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
-    known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
-    stills = [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
+    stills = stills_of(path)
     for root in chain(filmed_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
             return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
-            files = _layout(folders, calibration)
+            files = _layout(folders, calibration, root)
             # Else depth maps, for example, next to images/CAMERA.
             if root != path or not stills or _poses(calibration, files):
                 return pictured(root, files, partial=bool(calibration.unposed))
@@ -104,11 +107,17 @@ def open_posed(
         # Structure from motion often leaves out some photos.
         return pictured(stills[0][0], {name: {"0": file} for name, file in stills[0][1].items()}, partial=True)
     for root in other_roots(path, pictures=True):
-        return pictured(root, _layout(pictures_in(root), calibration), partial=bool(calibration.unposed))
+        return pictured(root, _layout(pictures_in(root), calibration, root), partial=bool(calibration.unposed))
     raise NoFrames(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         f"frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4{unread_files(path)}."
     )
+
+
+def stills_of(path: Path) -> list[tuple[Path, dict[str, Path]]]:
+    """Folders of one picture a camera, in order, with these by name."""
+    known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
+    return [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
 
 
 class NoFrames(CaptureError):
@@ -219,22 +228,27 @@ def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> in
     return orientation if calibration.turned_by_exif else 1
 
 
-def _layout(folders: Pictures, calibration: Calibration) -> Pictures:
-    """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras."""
+def _layout(folders: Pictures, calibration: Calibration, root: Path) -> Pictures:
+    """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras.
+
+    Where frames and cameras have the same numbers the name of the folder that holds them decides: ``frames``.
+    """
     per_frame: dict[str, dict[str, Path]] = {}
     for folder, pictures in folders.items():
         for stem, file in pictures.items() if re.search(r"\d", folder) else ():  # frames have numbers
             per_frame.setdefault(stem, {})[folder] = file
-    found: list[tuple[int, Pictures]] = []
+    found: list[tuple[tuple[bool, int], Pictures]] = []  # whether all have a pose, and how many
     reasons: list[CalibrationError] = []
     names = [_parts(posed.name) for posed in calibration.cameras]
     in_frames = any(len(parts) == 1 or not folders.keys().isdisjoint(parts[:-1]) for parts in names)
-    for files in (folders, per_frame) if in_frames else (folders,):
+    layouts = (per_frame, folders) if root.name.lower() == "frames" else (folders, per_frame)
+    for files in layouts if in_frames else (folders,):
         try:
-            found.append((len(_poses(calibration, files)), files))
+            count = len(_poses(calibration, files))
+            found.append(((count == len(files), count), files))
         except CalibrationError as error:
             reasons.append(error)
-    count, files = max(found, key=lambda candidate: candidate[0], default=(0, folders))
+    (_, count), files = max(found, key=lambda candidate: candidate[0], default=((False, 0), folders))
     if not count and reasons:
         raise reasons[0]
     return files if count else folders
@@ -339,7 +353,34 @@ def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibra
         width, height = posed.size or size
         camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
         filmed[name] = LensCamera(at_picture_size(camera, size, name=name, where=where), posed.lens)
+    _warn_of_sizes(filmed, poses, where)
     return filmed
+
+
+def _warn_of_sizes(filmed: Mapping[str, LensCamera], poses: Mapping[str, PosedCamera], where: Path) -> None:
+    """Warns of pictures that a calibration may not be for, though their proportions are right."""
+    cameras = {name: own.camera for name, own in filmed.items()}
+    middles = [
+        (camera.K[:2, 2] / camera.K.new_tensor([camera.width, camera.height])).tolist()
+        for name, camera in cameras.items()
+        if poses[name].size is None
+    ]
+    middle = np.mean(middles or [[0.5, 0.5]], 0)
+    if middle.max() < 0.5 - OFF_CENTER or middle.min() > 0.5 + OFF_CENTER:
+        log.warning(
+            "%s states no size of pictures, and its principal points lie at %.0f %% of their width and %.0f %% of "
+            "their height: it may be for pictures of another size; use those, or scale its intrinsics",
+            where, *(100 * middle),
+        )  # fmt: skip
+    for name, camera in cameras.items():
+        size = poses[name].size or (camera.width, camera.height)
+        if camera.width != size[0] and abs(camera.width / size[0] - 1) < NEARLY_SAME:
+            log.warning(
+                "%s is for pictures of %dx%d pixels, those of camera %r have %dx%d, hardly another size: one may be of "
+                "undistorted pictures (colmap image_undistorter), the other of those as filmed; use both of one kind",
+                where, *size, name, camera.width, camera.height,
+            )  # fmt: skip
+            return
 
 
 def _rig(
@@ -356,8 +397,11 @@ def filmed_by(calibration: Calibration, sizes: Sizes, *, root: Path) -> dict[str
     """The cameras of a calibration with their lenses, for pictures in ``root`` of ``sizes``, width and height.
 
     Raises:
-        CalibrationError: it is of other cameras, of one that moves, or for pictures of other proportions.
+        CalibrationError: it is of other cameras, of one that moves, cameras of one pose, or for pictures of
+            other proportions.
     """
     poses = _poses(calibration, sizes)
     _check(poses, sizes, calibration=calibration, root=root)
-    return _filmed(poses, sizes, calibration)
+    filmed = _filmed(poses, sizes, calibration)
+    check_poses({name: own.camera for name, own in filmed.items()}, where=calibration.where)
+    return filmed

@@ -2,8 +2,8 @@
 """``transforms.json`` of Blender, instant-ngp, nerfstudio and others, as a calibration and as a capture.
 
 Poses are camera to world in OpenGL axes. Intrinsics are at the top or in each frame: ``fl_x``, ``fl_y``, ``cx``,
-``cy``, ``w``, ``h``, or Blender's ``camera_angle_x``; ``k1`` ... ``p2``; ``camera_model``. The top-left pixel's centre
-is (0.5, 0.5), as here. ``transforms_test.json`` is held out.
+``cy``, ``w``, ``h``, or angles, as Blender's ``camera_angle_x``; ``k1`` ... ``p2``; ``camera_model``. The top-left
+pixel's centre is (0.5, 0.5), as here. ``transforms_test.json`` is held out.
 
 Pictures of one pose are of one camera. If each has a ``time``, the instants are the times; otherwise pictures and
 videos are found by the cameras' names, as with other calibrations, so that a file of one instant serves for all. A
@@ -84,6 +84,10 @@ def _shots_of(file: Path) -> list[Shot]:
         content = mapping(read_json(file))
         frames = [{**content, **mapping(frame)} for frame in content["frames"]]
         entries = [(str(frame["file_path"]), frame) for frame in frames]
+    if any(frame.get("mask_path") for frame in frames):
+        log.warning(
+            "%s: the pictures of mask_path are not read; masks lie in masks/CAMERA.png, black does not count", file
+        )
     pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
     taken: list[tuple[Path, float | None]] = []
 
@@ -110,19 +114,29 @@ def _camera(name: str, frame: dict[str, Any], picture: Path, where: Path) -> Pos
         width, height = picture_size(picture)
     else:
         raise KeyError("w and h")
-    if frame.get("fl_x") is not None:
-        fx = number(frame["fl_x"])
-    elif not 0 < (angle := number(frame["camera_angle_x"])) < math.pi:
-        raise Unreadable(f"camera_angle_x of {angle:g} radians")
-    else:
-        fx = width / 2 / math.tan(angle / 2)
-    stated = {key: frame[key] for key in ("fl_y", "cx", "cy") if frame.get(key) is not None}
-    K = intrinsics(fx, stated.get("fl_y", fx), stated.get("cx", width / 2), stated.get("cy", height / 2))
+    fx, fy = _focal(frame, "x", width), _focal(frame, "y", height)
+    if fx is None and fy is None:
+        raise KeyError("fl_x or camera_angle_x")
+    stated = {key: frame[key] for key in ("cx", "cy") if frame.get(key) is not None}
+    cx, cy = stated.get("cx", width / 2), stated.get("cy", height / 2)
+    K = intrinsics(fy if fx is None else fx, fx if fy is None else fy, cx, cy)  # square pixels if one is stated
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
     pose = np.vstack([pose, [0, 0, 0, 1]]) if pose.shape == (3, 4) else pose.reshape(4, 4)
     viewmat = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
     inside = picture.relative_to(where.parent).as_posix()
     return PosedCamera(inside, viewmat, K, (width, height), _lens(name, frame, where))
+
+
+def _focal(frame: dict[str, Any], axis: str, side: int) -> float | None:
+    """The focal length along an axis in pixels, which may be stated as the angle that the picture's side spans."""
+    if frame.get(f"fl_{axis}") is not None:
+        return number(frame[f"fl_{axis}"])
+    if frame.get(f"camera_angle_{axis}") is None:
+        return None
+    angle = number(frame[f"camera_angle_{axis}"])
+    if not 0 < angle < math.pi:
+        raise Unreadable(f"camera_angle_{axis} of {angle:g} radians")
+    return side / 2 / math.tan(angle / 2)
 
 
 def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
@@ -131,9 +145,10 @@ def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
     k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model in FISHEYES:
         return Fisheye(k1, k2, k3, k4)
-    if model in PINHOLES or (model in OPENCVS and not any((k1, k2, k3, k4, p1, p2))):
+    # As nerfstudio and instant-ngp do: coefficients count whatever the name of the model.
+    if model in (*PINHOLES, *OPENCVS) and not any((k1, k2, k3, k4, p1, p2)):
         return Pinhole()
-    if model not in OPENCVS or (k4 and model != "FULL_OPENCV"):
+    if model not in (*PINHOLES, *OPENCVS) or (k4 and model != "FULL_OPENCV"):
         raise CalibrationError(
             f"The camera of {name!r} of {where} is of the model {model}{' with k4' if k4 else ''}, which is not known "
             f"here; expected {', '.join((*PINHOLES, *OPENCVS, *FISHEYES))} (k1, k2, k3, p1, p2)."

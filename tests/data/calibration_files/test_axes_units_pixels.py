@@ -49,7 +49,7 @@ def test_pixels_are_those_of_opencv(tool: str, tmp_path: Path) -> None:
         assert camera.size == (None if tool in WITHOUT_SIZE else (WIDTH, HEIGHT))
 
 
-@pytest.mark.parametrize("tool", ["anipose", "kalibr", "opencv_cameras", "transforms"])
+@pytest.mark.parametrize("tool", ["anipose", "kalibr", "multical", "opencv_cameras", "transforms"])
 def test_fisheyes(tool: str, tmp_path: Path) -> None:
     cameras = [replace(camera, fisheye=True) for camera in truths(dist=(0.05, -0.01, 0.002, -0.001))]
     WRITERS[tool](tmp_path, cameras)

@@ -121,8 +121,11 @@ def test_qualisys_sensor_units(tmp_path: Path) -> None:
         tools.QUALISYS.read(next(tools.QUALISYS.find(tmp_path)))
 
 
-def test_marker_cameras_of_qualisys_are_no_cameras(tmp_path: Path) -> None:
-    found = tools.QUALISYS.read((write_qualisys(tmp_path, truths()),))
+@pytest.mark.parametrize("model", ["Miqus Video", "Miqus Hybrid", "none"])
+def test_marker_cameras_of_qualisys_are_no_cameras(tmp_path: Path, model: str) -> None:
+    file = write_qualisys(tmp_path, truths())
+    file.write_text(file.read_text().replace("Miqus Video", model))
+    found = tools.QUALISYS.read((file,))
     assert [camera.name for camera in found.cameras] == ["cam00", "cam01", "cam02"]
 
 

@@ -35,13 +35,18 @@ SPELLINGS: Mapping[str, tuple[str, ...]] = {
     "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
     "size": ("imagesize", "imgsize", "size", "resolution"),
     "name": ("name", "id", "serial"),
-    "fisheye": ("fisheyemodel", "fisheye", "distortiontype"),
+    "fisheye": ("fisheyemodel", "fisheye", "isfisheye", "distortiontype"),
+    "lens": ("distortiontype", "distortionmodel", "lensmodel", "lenstype", "len", "projectiontype", "model", "type"),
 }  # fmt: skip
 """Keys without marks between words, without :data:`FILLING` and in lower case; of several the first counts."""
 FILLING = re.compile(
     r"world2cam(era)?|worldtocam(era)?|w2c|camera(?!pose)|cam(?!erapose)|matrix|mat|mtx|vector|vec|coefficients?|coeffs?|coefs?|"
     r"param(eter)?s?|s$"
 )
+FISHEYES = re.compile(r"fish|equidist|\bequi\b|kannala")
+OTHER_LENSES = re.compile(r"omni(?!vision)|unified|ucm|double.?sphere|division|equirect")
+"""Words in the names of lens models: of OpenCV's fisheye, and of those that are not known here. Others are OpenCV's or
+names of products."""
 SHAPES = {
     "K": {(3, 3): (3, 3), (9,): (3, 3)},
     **{
@@ -97,6 +102,11 @@ def _entries(files: tuple[Path, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
             raise CalibrationError(
                 f"Camera {name!r} of {where} cannot be read ({reason(error)}); expected {EXPECTED}."
             ) from None
+        if len(groups := {str(content.get("camera_group", 0)) for content in tables.values()}) > 1:
+            raise CalibrationError(
+                f"{file} has {len(groups)} groups of cameras that saw no board in common, each with a world of its "
+                "own; film the board so that every camera shares it with another, and calibrate again."
+            )
         yield from ((own or name, content) for own, content in tables.items() or {name: {}}.items())
 
 
@@ -110,7 +120,8 @@ def _tables(file: Path) -> dict[str, dict[str, Any]]:
         if isinstance(group, dict):
             named += group.items()
         elif isinstance(group, list):
-            named += ((_value(one, "name"), one) for one in group if isinstance(one, dict))
+            listed = enumerate(one for one in group if isinstance(one, dict))
+            named += ((index if (name := _value(one, "name")) is None else name, one) for index, one in listed)
     split = ((str(key), _with_intrinsics(one)) for key, one in named if isinstance(one, dict))
     return {key: one for key, one in split if _value(one, "K") is not None}
 
@@ -139,10 +150,19 @@ def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
         viewmat=_pose(content),
         K=from_integer_centers(K),
         size=None if size is None else pixels(np.ravel(size).tolist()),
-        lens=(fisheye_lens if str(_value(content, "fisheye") or 0) not in ("0", "false") else opencv_lens)(
+        lens=(fisheye_lens if _is_fisheye(content) else opencv_lens)(
             [] if coefficients is None else np.ravel(coefficients).tolist()
         ),
     )
+
+
+def _is_fisheye(content: dict[str, Any]) -> bool:
+    """Whether a camera is of OpenCV's fisheye model, by a flag or by the name of its model."""
+    names = " ".join(str(value).lower() for value in _values(content, "lens"))
+    if OTHER_LENSES.search(names):
+        raise Unreadable(f"the lens model {names}, which is not known here")
+    flags = [str(value).lower() for value in _values(content, "fisheye")]
+    return not {"1", "true", "yes"}.isdisjoint(flags) or FISHEYES.search(f"{names} {' '.join(flags)}") is not None
 
 
 def _own_pose(content: dict[str, Any]) -> bool:
@@ -157,7 +177,8 @@ def _pose(content: dict[str, Any]) -> np.ndarray:
     """World to camera, ``[4, 4]``."""
     for key in ("pose", "inverse pose"):
         if (matrix := _value(content, key)) is not None:
-            viewmat = rigid(matrix[:3, :3], matrix[:3, 3])
+            viewmat = np.eye(4)
+            viewmat[: len(matrix)] = matrix
             return np.linalg.inv(viewmat) if key == "inverse pose" else viewmat
     rotation, translation = _value(content, "rotation"), _value(content, "translation")
     if rotation is None or translation is None:
@@ -167,19 +188,25 @@ def _pose(content: dict[str, Any]) -> np.ndarray:
 
 def _value(content: dict[str, Any], key: str) -> Any:
     """The first value that is spelled as ``key`` and has its shape; None where there is none."""
+    values = _values(content, key)
+    if key in SHAPES:
+        values = [matrix for value in values if (matrix := _shaped(value, SHAPES[key])) is not None]
+    return next(iter(values), None)
+
+
+def _values(content: dict[str, Any], key: str) -> list[Any]:
+    """What is spelled as ``key``, in the order of :data:`SPELLINGS`."""
     plain = [(FILLING.sub("", re.sub(r"[^a-z0-9]", "", name.lower())), value) for name, value in content.items()]
-    values = [value for spelling in SPELLINGS[key] for name, value in plain if name == spelling and value is not None]
-    if key not in SHAPES:
-        return next(iter(values), None)
-    shaped = ((value, SHAPES[key].get(_shape(value))) for value in values)
-    return next((np.reshape(np.array(value, np.float64), shape) for value, shape in shaped if shape is not None), None)
+    return [value for spelling in SPELLINGS[key] for name, value in plain if name == spelling and value is not None]
 
 
-def _shape(value: Any) -> tuple[int, ...]:
+def _shaped(value: Any, shapes: Mapping[tuple[int, ...], tuple[int, ...]]) -> np.ndarray | None:
+    """A matrix of one of these shapes; None for anything else, as a list of as many words."""
     try:
-        return np.shape(value)
-    except ValueError:  # rows of unequal length
-        return ()
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return None
+    return None if (shape := shapes.get(matrix.shape)) is None else matrix.reshape(shape)
 
 
 OPENCV_CAMERAS = CalibrationFormat(_find, _entries, _camera, EXPECTED, turned_by_exif=True, where=common_folder)

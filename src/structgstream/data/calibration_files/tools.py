@@ -82,7 +82,7 @@ def _anipose_entries(files: tuple[Path, ...]) -> Entries:
 
 
 def _anipose_camera(name: str, table: dict[str, Any]) -> PosedCamera:
-    if "rotation" not in table and "translation" not in table:
+    if all(table.get(key, "null") == "null" for key in ("rotation", "translation")):  # as earlier caliscopes write none
         raise NoPose
     K, dist, fisheye = table["matrix"], table["distortions"], bool(table.get("fisheye"))
     R, T = table["rotation"], table["translation"]
@@ -116,7 +116,8 @@ def _easymocap_camera(name: str, content: dict[str, Any]) -> PosedCamera:
 
 
 # multical: calibration.json with ``cameras`` and ``camera_poses``. Poses map the rig to the camera; those of a name
-# ``NAME_to_OTHER`` map the axes of OTHER to those of NAME, despite that name.
+# ``NAME_to_OTHER`` map the axes of OTHER to those of NAME, despite that name. Its ``--isFisheye`` shows in the shape of
+# the coefficients alone: a column of four, where OpenCV's other model has a row of five or more.
 
 
 def _multical_entries(files: tuple[Path, ...]) -> Entries:
@@ -145,7 +146,8 @@ def _multical_camera(name: str, entry: tuple[dict[str, Any], Mapping[str, NDArra
     if name not in poses:
         raise NoPose
     R, T = poses[name][:3, :3], poses[name][:3, 3]
-    return opencv_camera(name, K=camera["K"], dist=camera["dist"], R=R, T=T, size=camera["image_size"])
+    fisheye = np.shape(camera["dist"]) == (4, 1)
+    return opencv_camera(name, K=camera["K"], dist=camera["dist"], R=R, T=T, size=camera["image_size"], fisheye=fisheye)
 
 
 # Kalibr: camchain.yaml of pinholes with radtan or equidistant distortion. ``T_cn_cnm1`` maps the axes of the camera
@@ -219,7 +221,7 @@ def _zju_camera(name: str, row: list[Any]) -> PosedCamera:
 # right, y up, z backward. The sensor counts from its border, so that the top-left pixel's centre is (0.5, 0.5).
 
 SUBPIXELS = 64
-VIDEO_MODELS = ("video", "none")
+VIDEO_MODELS = ("video", "hybrid", "none")  # a hybrid camera films markers and video
 
 
 def _qualisys_entries(files: tuple[Path, ...]) -> Entries:
