@@ -58,7 +58,7 @@ from structgstream.data.dataset_layouts import (
     open_panoptic,
 )
 from structgstream.data.images import PICTURE_SUFFIXES
-from structgstream.data.masks import FOLDER, with_masks
+from structgstream.data.masks import masks_folder, with_masks
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, read_prepared, recognizes_prepared
 from structgstream.data.roving import with_roving
@@ -321,7 +321,7 @@ class Uncalibrated(CaptureError):
 
 def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
     try:
-        return with_masks(opens(folder), folder / FOLDER)
+        return with_masks(opens(folder), masks_folder(folder))
     except NoFrames:
         if (above := _above(folder)) is None:
             raise
