@@ -172,3 +172,9 @@ def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:
     edit_json(tmp_path / "transforms.json", change)
     source = open_capture(tmp_path)
     assert (len(source), source.fps, list(source.rig)) == (FRAMES, 60.0, ["cam00", "cam01", "cam02"])
+
+
+def test_masks_that_the_file_names_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png", mask_path="masks_of_nerfstudio/0.png")
+    open_capture(tmp_path)
+    assert "names masks (mask_path), which are not read; copy them to masks/CAMERA/FRAME.png" in caplog.text
