@@ -6,6 +6,7 @@ top-left pixel at (0.5, 0.5). See ``docs/conventions.md``. Learning rates and vo
 size (paper, section Implementations), so training runs in normalised units. The stream header stores the transform.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -212,6 +213,58 @@ class Similarity:
     def rig(self, rig: CameraRig) -> CameraRig:
         """Every camera of ``rig`` through :meth:`camera`."""
         return rig.mapped({name: self.camera(rig[name]) for name in rig})
+
+
+MAX_SKEW_PIXELS = 0.5
+ONE_PLACE = 1e-12
+"""Radius of a rig, as a share of its cameras' distance to the origin, below which it is what rounding leaves."""
+
+
+def skew_pixels(camera: Camera) -> float:
+    """How far the skew of the intrinsics, which is not drawn, moves the upper and lower border of the picture."""
+    return float(camera.K[0, 1].abs() / camera.K[1, 1]) * camera.height / 2
+
+
+def check_matrices(camera: Camera) -> None:
+    """Check that the view matrix is one of a rigid motion, not a transposed one, and the intrinsics are of a pinhole.
+
+    Raises:
+        CalibrationError: they are not, or the near plane is not positive.
+    """
+    rows = {"view matrix": (camera.viewmat[3], [0.0, 0.0, 0.0, 1.0]), "K": (camera.K[2], [0.0, 0.0, 1.0])}
+    for name, (row, expected) in rows.items():
+        if not torch.allclose(row, torch.tensor(expected, dtype=row.dtype), rtol=0, atol=1e-6):
+            raise CalibrationError(
+                f"The last row of the {name} is {row.tolist()}; expected {expected}. Matrices are given row by row: "
+                "transpose it if it is column by column."
+            )
+    if not 0 < camera.near < math.inf:
+        raise CalibrationError(f"The near plane must be positive, got {camera.near:g}.")
+
+
+def check_rig(rig: CameraRig) -> None:
+    """Check that the cameras can be drawn as they are calibrated, and see depth.
+
+    Raises:
+        CalibrationError: a matrix is of another form (:func:`check_matrices`), pixels are not rectangular, or the
+            training cameras stand at one place.
+    """
+    farthest = max(float(rig[name].center.norm()) for name in rig.training)
+    if rig_radius(rig) <= ONE_PLACE * farthest:
+        raise CalibrationError(
+            f"All {len(rig.training)} training cameras stand at one place, so nothing has a depth; look whether the "
+            "translations of their poses are missing."
+        )
+    for name in rig:
+        try:
+            check_matrices(rig[name])
+        except CalibrationError as error:
+            raise CalibrationError(f"Camera {name!r}: {error}") from None
+        if skew_pixels(rig[name]) > MAX_SKEW_PIXELS or rig[name].K[1, 0] != 0:
+            raise CalibrationError(
+                f"Camera {name!r} has a K whose first two rows are {rig[name].K[:2].tolist()}; expected [fx, 0, cx] "
+                "and [0, fy, cy]: calibrate without skew, or undistort the pictures."
+            )
 
 
 NEAR_IN_RIG_RADII = 0.12

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import from_numpy
 
-from structgstream.cameras import NEAR_IN_RIG_RADII, Camera, CameraRig, rig_radius
+from structgstream.cameras import NEAR_IN_RIG_RADII, Camera, CameraRig, check_matrices, rig_radius
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.data.text_files import BROKEN, Unreadable, number, readable, reason
 from structgstream.errors import CalibrationError, CaptureError
@@ -103,6 +103,7 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         if extrinsics.shape == (3, 4):
             extrinsics = np.vstack([extrinsics, [0.0, 0.0, 0.0, 1.0]])
         camera = Camera(from_numpy(extrinsics), from_numpy(intrinsics), width, height)
+        check_matrices(camera)
     except CalibrationError as error:
         raise CalibrationError(f"Camera {name!r} of {where}: {error}") from None
     except BROKEN as error:
@@ -224,6 +225,8 @@ def check_held_out(held_out: Collection[str], cameras: Collection[str], *, where
     Raises:
         CalibrationError: one is not.
     """
+    if isinstance(held_out, str):
+        raise CalibrationError(f"{where} holds out {held_out!r}; expected a list of names, [{held_out!r}].")
     if unknown := [name for name in held_out if name not in cameras]:
         raise CalibrationError(
             f"{where} holds out {listed(unknown)}, which it does not have; its cameras are {', '.join(cameras)}."

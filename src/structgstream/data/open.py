@@ -29,7 +29,7 @@ from typing import Literal
 
 import numpy as np
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, check_rig
 from structgstream.data import transforms
 from structgstream.data.calibration import Calibration, alignment, with_near
 from structgstream.data.calibration_files import tools
@@ -321,7 +321,12 @@ class Uncalibrated(CaptureError):
 
 def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
     try:
-        return with_masks(opens(folder), masks_folder(folder))
+        source = opens(folder)
+        try:
+            check_rig(source.rig)
+        except CalibrationError as error:
+            raise CalibrationError(f"{folder}: {error}") from None
+        return with_masks(source, masks_folder(folder))
     except NoFrames:
         if (above := _above(folder)) is None:
             raise

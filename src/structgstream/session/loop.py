@@ -14,7 +14,7 @@ from typing import Generic
 
 import torch
 
-from structgstream.cameras import CameraRig, Similarity, normalizing_similarity
+from structgstream.cameras import CameraRig, Similarity, check_rig, normalizing_similarity
 from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
@@ -60,7 +60,7 @@ class Session(Generic[State, Memory]):
         on_step: called after every optimisation step.
 
     Raises:
-        CalibrationError: the pictures of a camera are larger than a stream allows.
+        CalibrationError: the pictures of a camera are larger than a stream allows, or it cannot be drawn as calibrated.
         ConfigError: the source has no rate, or the stream to resume was made with another configuration or from
             another capture.
     """
@@ -77,6 +77,7 @@ class Session(Generic[State, Memory]):
         on_step: StepListener | None = None,
     ) -> None:
         check_picture_sizes(source.rig)
+        check_rig(source.rig)
         check_rate(source.fps)
         self._source = denoised(source, pipeline.denoising, at=pipeline.denoised)
         self._sink = sink
