@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -60,6 +61,19 @@ def test_rig_order_and_held_out_sets() -> None:
 def test_one_training_camera_is_not_enough() -> None:
     with pytest.raises(CalibrationError, match="at least two training cameras"):
         CameraRig({"a": arc_rig()["cam01"], "b": arc_rig()["cam02"]}, held_out=frozenset({"a"}))
+
+
+def test_rigs_and_cameras_of_other_types() -> None:
+    cameras = arc_rig().cameras
+    held: Any = ["cam00"]  # a list is as good
+    assert CameraRig(cameras, held).testing == ("cam00",)
+    for given, held, words in (([*cameras.values()], (), "by name"), (cameras, "cam00", r"as \('cam00',\)")):
+        wrong: Any = given
+        with pytest.raises(CalibrationError, match=words):
+            CameraRig(wrong, held)
+    half: Any = 48.0
+    with pytest.raises(CalibrationError, match=r"whole pixels, got 48\.0x32"):
+        replace(cameras["cam00"], width=half)
 
 
 def edited(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.Tensor:

@@ -7,6 +7,7 @@ size (paper, section Implementations), so training runs in normalised units. The
 """
 
 import math
+import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -84,6 +85,11 @@ class Camera:
                 "The rotation of the view matrix is not orthonormal with determinant +1; expected a rigid "
                 "world-to-camera matrix (OpenCV axes) without scale or mirror."
             )
+        try:
+            object.__setattr__(self, "width", operator.index(self.width))
+            object.__setattr__(self, "height", operator.index(self.height))
+        except TypeError:
+            raise CalibrationError(f"A picture has whole pixels, got {self.width!r}x{self.height!r}.") from None
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or self.width <= 0 or self.height <= 0:
             raise CalibrationError(
                 f"Focal lengths and image size must be positive, got fx={self.K[0, 0]:g}, fy={self.K[1, 1]:g}, "
@@ -130,6 +136,11 @@ class CameraRig:
     held_out: frozenset[str] = field(default_factory=frozenset)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Mapping) or not all(isinstance(name, str) for name in self.cameras):
+            raise CalibrationError("A rig has cameras by name, as {'cam00': Camera(...), ...}.")
+        if isinstance(self.held_out, str):
+            raise CalibrationError(f"held_out takes names of cameras, as ({self.held_out!r},); got {self.held_out!r}.")
+        object.__setattr__(self, "held_out", frozenset(self.held_out))
         unknown = sorted(self.held_out - set(self.cameras))
         if unknown:
             raise CalibrationError(

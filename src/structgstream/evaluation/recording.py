@@ -111,8 +111,10 @@ def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> Fram
 def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
     """The cameras to score: the named ones, or all that were held out. Raises ConfigError if a name is unknown, or no
     camera was held out and none is named."""
-    if cameras is None:
-        if not header.rig.testing:
+    if isinstance(cameras, str):
+        raise ConfigError(f"cameras takes a list of names, as ({cameras!r},); got {cameras!r}.")
+    if not cameras:
+        if cameras is not None or not header.rig.testing:
             raise ConfigError(
                 "The stream has no held-out camera to score; name cameras with --cameras (trained ones), "
                 "or reconstruct with --held-out."
