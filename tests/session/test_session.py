@@ -13,7 +13,7 @@ from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
-from structgstream.errors import CaptureError, ConfigError, StorageError
+from structgstream.errors import CalibrationError, CaptureError, ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
@@ -21,7 +21,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import struct_gstream as method
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session, frame_seed
-from structgstream.session.presets import StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.memory_captures import MemoryCapture
@@ -138,6 +138,13 @@ def test_a_source_that_contradicts_the_protocol_is_refused(
 ) -> None:
     with pytest.raises((CaptureError, ConfigError), match=words):
         run(replace(capture(), **wrong), MemorySink())
+
+
+def test_a_near_plane_behind_the_scene_is_named(quick_fits: list[int]) -> None:
+    source = capture()
+    rig = source.rig.mapped({name: replace(camera, near=1e4) for name, camera in source.rig.cameras.items()})
+    with pytest.raises(CalibrationError, match="near plane lies at .* times the rig's radius, by default at 0.12"):
+        run(replace(source, rig=rig), MemorySink(), config=PRESETS["tiny"])
 
 
 def test_resuming_gives_the_bytes_of_an_uninterrupted_run(quick_fits: list[int], tmp_path: Path) -> None:
