@@ -11,7 +11,7 @@ import torch
 
 import structgstream
 from structgstream.cli import main
-from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
+from structgstream.errors import BackendError, CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.kernels.backend import select_backend
@@ -79,6 +79,8 @@ def test_a_capture_that_is_open(stream: Path, tmp_path: Path) -> None:
         ({"quality": 90.0}, "not one of -6 to 6"),
         ({"resume": True, "overwrite": True}, "choose one"),
         ({"scale": 3.0}, "(0, 1]"),
+        ({"sink": "folder"}, "sink is 'file' or 'segments'; got 'folder'"),
+        ({"preset": Path("tiny")}, "preset is a name or a StreamConfig"),
     ],
 )
 def test_wrong_wishes_are_reported_before_anything_is_written(
@@ -88,6 +90,19 @@ def test_wrong_wishes_are_reported_before_anything_is_written(
         structgstream.reconstruct(CLIP, tmp_path / "x.sgs", **wishes)
     assert words in str(caught.value)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("wishes", "words"),
+    [
+        ({"metrics": "LPIPS"}, "metrics is one of all, basic; got 'LPIPS'"),
+        ({"cameras": "cam00"}, r"cameras takes a list of names, as \('cam00',\)"),
+        ({"backend": "cuda:0"}, "no back-end 'cuda:0'; there are auto, cuda, cpu, reference"),
+    ],
+)
+def test_wrong_wishes_of_scores_are_reported(stream: Path, wishes: dict[str, Any], words: str) -> None:
+    with pytest.raises((BackendError, ConfigError), match=words):
+        structgstream.evaluate(stream, CLIP, **wishes)
 
 
 def test_pictures_are_asked_for_by_a_camera_or_its_name(stream: Path) -> None:

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
-from structgstream.cameras import Camera, CameraRig, Similarity, normalizing_similarity, rig_radius
+from structgstream.cameras import Camera, CameraRig, Similarity, check_rig, normalizing_similarity, rig_radius
 from structgstream.errors import CalibrationError
 from tests.support.rigs import arc_rig
 
@@ -59,6 +61,56 @@ def test_rig_order_and_held_out_sets() -> None:
 def test_one_training_camera_is_not_enough() -> None:
     with pytest.raises(CalibrationError, match="at least two training cameras"):
         CameraRig({"a": arc_rig()["cam01"], "b": arc_rig()["cam02"]}, held_out=frozenset({"a"}))
+
+
+def test_rigs_and_cameras_of_other_types() -> None:
+    cameras = arc_rig().cameras
+    held: Any = ["cam00"]  # a list is as good
+    assert CameraRig(cameras, held).testing == ("cam00",)
+    for given, held, words in (([*cameras.values()], (), "by name"), (cameras, "cam00", r"as \('cam00',\)")):
+        wrong: Any = given
+        with pytest.raises(CalibrationError, match=words):
+            CameraRig(wrong, held)
+    half: Any = 48.0
+    with pytest.raises(CalibrationError, match=r"whole pixels, got 48\.0x32"):
+        replace(cameras["cam00"], width=half)
+
+
+def edited(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.Tensor:
+    changed = matrix.clone()
+    changed[row, column] = value
+    return changed
+
+
+def test_cameras_that_cannot_be_drawn_as_they_are_calibrated_are_refused() -> None:
+    rig = arc_rig()
+    check_rig(rig)
+    camera = rig["cam01"]
+    for wrong, words in (
+        (replace(camera, viewmat=edited(camera.viewmat, 3, 2, 3.0)), "last row of the view matrix is .* transpose"),
+        (replace(camera, K=edited(camera.K, 2, 0, 24.0)), "last row of the K is"),
+        (replace(camera, K=edited(camera.K, 0, 1, 2.0)), "first two rows are .* calibrate without skew"),
+        (replace(camera, near=0.0), "near plane must be positive, got 0"),
+    ):
+        with pytest.raises(CalibrationError, match=f"^(Camera 'cam01').*{words}"):
+            check_rig(rig.mapped({**rig.cameras, "cam01": wrong}))
+    check_rig(rig.mapped({**rig.cameras, "cam01": replace(camera, K=edited(camera.K, 0, 1, 1e-3))}))
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 300.0)])
+def test_cameras_at_one_place_see_no_depth(place: tuple[float, float, float]) -> None:
+    rig, center = arc_rig(), torch.tensor(place, dtype=torch.float64)
+    for shift, refused in ((0.0, True), (0.1, False)):
+        turned = {}
+        for number, name in enumerate(rig):
+            viewmat = rig[name].viewmat.clone()
+            viewmat[:3, 3] = -viewmat[:3, :3] @ (center + shift * number)
+            turned[name] = replace(rig[name], viewmat=viewmat)
+        if refused:
+            with pytest.raises(CalibrationError, match="All 3 cameras stand at one place"):
+                check_rig(rig.mapped(turned))
+        else:
+            check_rig(rig.mapped(turned))
 
 
 def pixel(camera, point):

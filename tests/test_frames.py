@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from structgstream.frames import MultiViewFrame
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame, check_pictures
+from tests.support.rigs import arc_rig
+
+RIG = arc_rig()
 
 
 def test_its_text_tells_shapes_and_not_pixels() -> None:
@@ -46,3 +52,30 @@ def test_what_a_mask_leaves_out_does_not_make_a_picture() -> None:
     mask[:, :8] = False
     masked = replace(frame, masks={"c1": mask, "c2": np.zeros((48, 64), bool)})
     assert masked.showing(frame.images) == ("c0", "c3", "c4")
+
+
+def wrong(name: str, image: Any = None, mask: Any = None) -> MultiViewFrame:
+    frame = MultiViewFrame(0, 0.0, {name: np.zeros((32, 48, 3), np.uint8) for name in RIG})
+    images = {**frame.images, name: frame.images["cam01"] if image is None else image}
+    return replace(frame, images=images, masks={} if mask is None else {name: mask})
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        (wrong("cam01", np.zeros((32, 48, 3))), r"'cam01' in frame 0 of hall is a ndarray of float64 \[32, 48, 3\]"),
+        (wrong("cam01", np.zeros((3, 32, 48), np.uint8)), r"uint8 \[3, 32, 48\]; .* uint8 \[32, 48, 3\], red first"),
+        (wrong("cam01", np.zeros((16, 24, 3), np.uint8)), r"uint8 \[16, 24, 3\]"),
+        (wrong("cam01", torch.zeros(32, 48, 3, dtype=torch.uint8)), r"a Tensor of uint8"),
+        (wrong("cam01", mask=np.full((32, 48), 255, np.uint8)), r"mask of camera 'cam01' .* uint8 .* bool \[32, 48\]"),
+        (wrong("cam1"), r"a picture of camera 'cam1', which the rig does not have; its cameras are cam00, cam01"),
+    ],
+)
+def test_pictures_of_another_type_or_size_are_refused(frame: MultiViewFrame, words: str) -> None:
+    check_pictures(wrong("cam01", mask=np.ones((32, 48), bool)), RIG, capture="hall")
+    with pytest.raises(CaptureError, match=words):
+        check_pictures(frame, RIG, capture="hall")
+
+
+def test_pictures_of_held_out_cameras_are_not_looked_at() -> None:
+    check_pictures(wrong("cam00", np.zeros(3)), RIG, capture="hall")

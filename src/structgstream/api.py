@@ -159,6 +159,10 @@ def reconstruct(
     """
     if resume and overwrite:
         raise ConfigError("resume continues the file and overwrite replaces it: choose one.")
+    if sink not in ("file", "segments"):
+        raise ConfigError(f"sink is 'file' or 'segments'; got {sink!r}.")
+    if not isinstance(preset, StreamConfig | str):
+        raise ConfigError(f"preset is a name or a StreamConfig, such as PRESETS['compact']; got {preset!r}.")
     if window_seconds is not None and not (sink == "segments" and 0.0 < window_seconds < math.inf):
         raise ConfigError(
             f"window_seconds is a positive number of seconds, for sink='segments'; got {window_seconds:g} for "

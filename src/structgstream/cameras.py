@@ -6,7 +6,9 @@ top-left pixel at (0.5, 0.5). See ``docs/conventions.md``. Learning rates and vo
 size (paper, section Implementations), so training runs in normalised units. The stream header stores the transform.
 """
 
-from collections.abc import Iterator, Mapping
+import math
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -83,6 +85,11 @@ class Camera:
                 "The rotation of the view matrix is not orthonormal with determinant +1; expected a rigid "
                 "world-to-camera matrix (OpenCV axes) without scale or mirror."
             )
+        try:
+            object.__setattr__(self, "width", operator.index(self.width))
+            object.__setattr__(self, "height", operator.index(self.height))
+        except TypeError:
+            raise CalibrationError(f"A picture has whole pixels, got {self.width!r}x{self.height!r}.") from None
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or self.width <= 0 or self.height <= 0:
             raise CalibrationError(
                 f"Focal lengths and image size must be positive, got fx={self.K[0, 0]:g}, fy={self.K[1, 1]:g}, "
@@ -129,6 +136,11 @@ class CameraRig:
     held_out: frozenset[str] = field(default_factory=frozenset)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Mapping) or not all(isinstance(name, str) for name in self.cameras):
+            raise CalibrationError("A rig has cameras by name, as {'cam00': Camera(...), ...}.")
+        if isinstance(self.held_out, str):
+            raise CalibrationError(f"held_out takes names of cameras, as ({self.held_out!r},); got {self.held_out!r}.")
+        object.__setattr__(self, "held_out", frozenset(self.held_out))
         unknown = sorted(self.held_out - set(self.cameras))
         if unknown:
             raise CalibrationError(
@@ -212,6 +224,63 @@ class Similarity:
     def rig(self, rig: CameraRig) -> CameraRig:
         """Every camera of ``rig`` through :meth:`camera`."""
         return rig.mapped({name: self.camera(rig[name]) for name in rig})
+
+
+MAX_SKEW_PIXELS = 0.5
+ONE_PLACE = 1e-12
+"""Distance of cameras, as a share of theirs to the origin, up to which it is what rounding leaves."""
+
+
+def skew_pixels(camera: Camera) -> float:
+    """How far the skew of the intrinsics, which is not drawn, moves the upper and lower border of the picture."""
+    return float(camera.K[0, 1].abs() / camera.K[1, 1]) * camera.height / 2
+
+
+def check_matrices(camera: Camera) -> None:
+    """Check that the view matrix is one of a rigid motion, not a transposed one, and the intrinsics are of a pinhole.
+
+    Raises:
+        CalibrationError: they are not, or the near plane is not positive.
+    """
+    rows = {"view matrix": (camera.viewmat[3], [0.0, 0.0, 0.0, 1.0]), "K": (camera.K[2], [0.0, 0.0, 1.0])}
+    for name, (row, expected) in rows.items():
+        if not torch.allclose(row, torch.tensor(expected, dtype=row.dtype), rtol=0, atol=1e-6):
+            raise CalibrationError(
+                f"The last row of the {name} is {row.tolist()}; expected {expected}. Matrices are given row by row: "
+                "transpose it if it is column by column."
+            )
+    if not 0 < camera.near < math.inf:
+        raise CalibrationError(f"The near plane must be positive, got {camera.near:g}.")
+
+
+def check_places(cameras: Sequence[Camera]) -> None:
+    """Check that not all cameras stand at one place. Raises CalibrationError if they do."""
+    centers = torch.stack([camera.center for camera in cameras])
+    if len(cameras) > 1 and (centers - centers[0]).norm(dim=1).max() <= ONE_PLACE * centers.norm(dim=1).max():
+        raise CalibrationError(
+            f"All {len(cameras)} cameras stand at one place, so nothing has a depth; look whether the translations of "
+            "their poses are missing."
+        )
+
+
+def check_rig(rig: CameraRig) -> None:
+    """Check that the cameras can be drawn as they are calibrated, and see depth.
+
+    Raises:
+        CalibrationError: a matrix is of another form (:func:`check_matrices`), pixels are not rectangular, or the
+            training cameras stand at one place.
+    """
+    check_places([rig[name] for name in rig.training])
+    for name in rig:
+        try:
+            check_matrices(rig[name])
+        except CalibrationError as error:
+            raise CalibrationError(f"Camera {name!r}: {error}") from None
+        if skew_pixels(rig[name]) > MAX_SKEW_PIXELS or rig[name].K[1, 0] != 0:
+            raise CalibrationError(
+                f"Camera {name!r} has a K whose first two rows are {rig[name].K[:2].tolist()}; expected [fx, 0, cx] "
+                "and [0, fy, cy]: calibrate without skew, or undistort the pictures."
+            )
 
 
 NEAR_IN_RIG_RADII = 0.12

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, CameraRig
+from structgstream.errors import CaptureError
 
 MIN_CAMERAS = 2
 """Training cameras that a frame needs, because a single picture does not determine depth."""
@@ -68,6 +69,34 @@ class MultiViewFrame:
     def __repr__(self) -> str:
         shapes = sorted({image.shape for image in self.images.values()})
         return f"MultiViewFrame(index={self.index}, pts_seconds={self.pts_seconds:.4f}, {len(self.images)} x {shapes})"
+
+
+def check_pictures(frame: MultiViewFrame, rig: CameraRig, *, capture: str) -> None:
+    """Check that the training pictures of a frame and their masks are of the type and size that the rig states.
+
+    Raises:
+        CaptureError: one is not, or the frame has a camera that the rig does not have.
+    """
+    if unknown := [name for name in frame.images if name not in rig.cameras]:
+        raise CaptureError(
+            f"Frame {frame.index} of {capture} has a picture of camera {unknown[0]!r}, which the rig does not have; "
+            f"its cameras are {', '.join(rig)}."
+        )
+    for name in rig.training:
+        size = (rig[name].height, rig[name].width)
+        for what, arrays, dtype, shape in (
+            ("picture", frame.images, np.uint8, (*size, 3)),
+            ("mask", frame.masks, np.bool_, size),
+        ):
+            if name not in arrays:
+                continue
+            given = np.asarray(arrays[name])
+            if not isinstance(arrays[name], np.ndarray) or given.dtype != dtype or given.shape != shape:
+                raise CaptureError(
+                    f"The {what} of camera {name!r} in frame {frame.index} of {capture} is a "
+                    f"{type(arrays[name]).__name__} of {given.dtype} {[*given.shape]}; expected a numpy array of "
+                    f"{np.dtype(dtype)} {[*shape]}{', red first' if what == 'picture' else ''}."
+                )
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def test_three_rows_of_a_pose_are_enough() -> None:
         (np.eye(4), K * [[np.nan], [1], [1]], "not finite"),
         (np.eye(4) * 2, K, "orthonormal"),
         (np.diag([1, 1, -1, 1]), K, "orthonormal"),
-        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0.2, 3, 1]], K, "last row .* written by columns"),
+        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0.2, 3, 1]], K, "last row .* transpose"),
         (np.diag([1, 1, 1, 2]), K, "last row"),
         (np.eye(3), K, "4x4"),
         ([[1, 2], [3]], K, "cannot be read"),
@@ -71,7 +71,7 @@ def test_a_principal_point_off_centre_is_accepted() -> None:
 
 @pytest.mark.parametrize(
     ("moved", "words"),
-    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "all cameras stand at one place")],
+    [((0, 0), "'a' and 'b' have the same pose"), ((0, 0.1), "All 2 cameras stand at one place")],
 )
 def test_cameras_without_poses_of_their_own_are_refused(moved: tuple[float, float], words: str) -> None:
     """Tools write zeros for what they did not calibrate."""

@@ -208,7 +208,7 @@ def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:
         camera.name: {"K": camera.K.tolist(), "extrinsics": rigid(camera.R, camera.T).T.tolist()} for camera in PINHOLES
     }
     (tmp_path / "calibration.json").write_text(json.dumps(content))
-    with pytest.raises(CalibrationError, match=r"'cam00' of .*json: the last row of its pose is not 0, 0, 0, 1"):
+    with pytest.raises(CalibrationError, match=r"'cam00' of .*json: The last row of the view matrix"):
         open_capture(tmp_path)
 
 

@@ -54,6 +54,24 @@ def test_another_rate_than_stated(tmp_path: Path) -> None:
         open_json_videos(tmp_path)
 
 
+@pytest.mark.parametrize("key", ["K", "viewmat"])
+def test_a_matrix_column_by_column(tmp_path: Path, key: str) -> None:
+    write_clip(tmp_path)
+    edit_json(
+        tmp_path / "cameras.json",
+        lambda content: content["cameras"]["cam01"].update({key: [*zip(*content["cameras"]["cam01"][key])]}),
+    )
+    with pytest.raises(CalibrationError, match="Camera 'cam01' of .*cameras.json: The last row of the .* transpose"):
+        open_json_videos(tmp_path)
+
+
+def test_a_name_in_place_of_a_list(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    edit_json(tmp_path / "cameras.json", lambda content: content.update(held_out="cam00"))
+    with pytest.raises(CalibrationError, match=r"holds out 'cam00'; expected a list of names, \['cam00'\]"):
+        open_json_videos(tmp_path)
+
+
 @pytest.mark.parametrize("change", [{"fps": 0}, {"fps": float("nan")}, {"near": -1}])
 def test_numbers_that_cannot_be(tmp_path: Path, change: dict[str, float]) -> None:
     write_clip(tmp_path)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Masks beside captures: which pixels count, through resampling and undistortion, and what is refused."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unicodedata import normalize
@@ -115,6 +116,40 @@ def test_a_decomposed_name_of_a_camera(tmp_path: Path) -> None:
     assert [(~frame.masks["süd"]).mean() for frame in open_capture(tmp_path).frames()] == [0.5, 0.75]
 
 
+@pytest.mark.parametrize(
+    "stored",
+    [
+        lambda mask: mask.astype(np.uint8),
+        lambda mask: mask.astype(np.uint16),
+        lambda mask: mask.astype(np.uint16)[..., None].repeat(3, 2),
+        lambda mask: np.dstack([np.full((HEIGHT, WIDTH, 3), 255, np.uint8), mask.astype(np.uint8) * 255]),
+    ],
+    ids=["0 and 1", "0 and 1 in 16 bits", "16 bits in colour", "alpha"],
+)
+def test_what_is_black_or_hidden_by_alpha_does_not_count(
+    tmp_path: Path, stored: Callable[[Mask], NDArray[np.integer]]
+) -> None:
+    write_clip(tmp_path, frames=2)
+    (tmp_path / "masks").mkdir()
+    assert cv2.imwrite(str(tmp_path / "masks/cam01.png"), stored(left_half()))
+    np.testing.assert_array_equal(next(open_capture(tmp_path).frames()).masks["cam01"], left_half())
+
+
+def test_capitals_of_the_folder_do_not_matter(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "Masks/cam01.png", left_half())
+    np.testing.assert_array_equal(next(open_capture(tmp_path).frames()).masks["cam01"], left_half())
+
+
+def test_masks_of_no_frame_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_clip(tmp_path, frames=2)
+    for number in (1, 2, 3):
+        write_mask(tmp_path / f"masks/cam01/{number}.png", left_half())
+    open_capture(tmp_path)
+    assert "2 masks in" in caplog.text
+    assert "are of no frame of the capture, such as 2.png" in caplog.text
+
+
 def test_a_mask_with_another_spelling_of_png_counts(tmp_path: Path) -> None:
     write_clip(tmp_path, frames=2)
     write_mask(tmp_path / "masks/cam01.png", left_half())
@@ -203,6 +238,7 @@ def test_a_camera_of_which_nothing_counts_is_not_present(tmp_path: Path) -> None
             "cam09.png is a mask of camera 'cam09', which the capture .* does not have; its cameras are cam00",
         ),
         ("cam01/17.png", r"None of the masks in .*cam01 is of a frame of the capture, such as 17\.png; .* 000000\.png"),
+        ("cam01/images/0.png", r"None of the masks in .*cam01 is of a frame .* such as images; .* 000000\.png"),
         ("cam01.jpg", r"cam01\.jpg is no PNG"),
     ],
 )
@@ -210,6 +246,14 @@ def test_masks_that_do_not_belong_are_refused(tmp_path: Path, name: str, words: 
     write_clip(tmp_path, frames=3)
     write_picture(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     with pytest.raises(CaptureError, match=words):
+        open_capture(tmp_path)
+
+
+def test_masks_as_a_video_are_refused(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=3)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/cam01.mp4").write_bytes((tmp_path / "cam01.mp4").read_bytes())
+    with pytest.raises(CaptureError, match=r"cam01\.mp4 is no PNG"):
         open_capture(tmp_path)
 
 

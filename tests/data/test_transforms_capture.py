@@ -124,12 +124,6 @@ def test_one_instant_serves_for_all(tmp_path: Path) -> None:
     assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
 
 
-def test_masks_of_nerfstudio_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write(tmp_path, "rgb/CAM/FRAME.png", mask_path="masks/0.png")
-    open_transforms(tmp_path)
-    assert "the pictures of mask_path are not read; masks lie in masks/CAMERA.png" in caplog.text
-
-
 def test_videos(tmp_path: Path) -> None:
     write_videos(tmp_path, [camera.name for camera in CAMERAS], frames=FRAMES)
     write_transforms(tmp_path, CAMERAS, pattern="NAME.mp4")
@@ -197,3 +191,9 @@ def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:
     edit_json(tmp_path / "transforms.json", change)
     source = open_capture(tmp_path)
     assert (len(source), source.fps, list(source.rig)) == (FRAMES, 60.0, ["cam00", "cam01", "cam02"])
+
+
+def test_masks_that_the_file_names_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png", mask_path="masks_of_nerfstudio/0.png")
+    open_capture(tmp_path)
+    assert "names masks (mask_path), which are not read; copy them to masks/CAMERA/FRAME.png" in caplog.text

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import CaptureError, ConfigError
@@ -76,6 +76,23 @@ def test_another_rig_is_reported(change: Callable[[CameraRig], CameraRig], words
     other = source(change(HEADER.rig))
     with pytest.raises(CaptureError, match=words):
         check_same_rig(HEADER, other, ("cam01",))
+
+
+@pytest.mark.parametrize("similarity", [Similarity(scale=1e-4), Similarity((-5e5, -5.4e6, 0.0))])
+def test_another_pose_is_reported_whatever_the_units(similarity: Similarity) -> None:
+    header = replace(HEADER, rig=similarity.rig(HEADER.rig))
+    check_same_rig(header, source(header.rig), ("cam01",))
+    viewmat = header.rig["cam01"].viewmat.clone()
+    viewmat[0, 3] += 0.01 * similarity.scale
+    with pytest.raises(CaptureError, match="another calibration"):
+        check_same_rig(header, source(with_camera(header.rig, "cam01", viewmat=viewmat)), ("cam01",))
+
+
+def test_a_capture_of_another_name_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    check_same_rig(replace(HEADER, metadata={"capture": "hall"}), source(HEADER.rig), ("cam01",))
+    assert not caplog.text
+    check_same_rig(replace(HEADER, metadata={"capture": "take1"}), source(HEADER.rig), ("cam01",))
+    assert "The stream was made from the capture 'take1', and is compared with 'hall'" in caplog.text
 
 
 def test_a_camera_that_is_not_scored_may_differ() -> None:

@@ -2,6 +2,7 @@
 import errno
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import CalibrationError, CaptureError, ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
@@ -20,7 +21,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import struct_gstream as method
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session, frame_seed
-from structgstream.session.presets import StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.memory_captures import MemoryCapture
@@ -113,6 +114,37 @@ def test_every_frame_has_a_seed_of_its_own(quick_fits: list[int]) -> None:
     uninterrupted()
     assert quick_fits == [frame_seed(0, i) for i in range(5)] == [0, 1, 2, 3, 4]
     assert frame_seed(2, 7) == 2_000_013
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"fps": -30.0}, "Frames a second must be positive, got -30"),
+        ({"points": np.zeros((60, 6))}, r"points of world have shape \(60, 6\); expected \[P, 3\]"),
+        ({"pictures": capture().pictures[1:]}, "world gives frame 1 where frame 0 belongs"),
+        (
+            {
+                "pictures": [
+                    replace(frame, images={n: i / 255 for n, i in frame.images.items()}) for frame in capture().pictures
+                ]
+            },
+            "float64 .*; expected a numpy array of uint8",
+        ),
+    ],
+    ids=["rate", "points", "numbers", "pictures"],
+)
+def test_a_source_that_contradicts_the_protocol_is_refused(
+    quick_fits: list[int], wrong: dict[str, Any], words: str
+) -> None:
+    with pytest.raises((CaptureError, ConfigError), match=words):
+        run(replace(capture(), **wrong), MemorySink())
+
+
+def test_a_near_plane_behind_the_scene_is_named(quick_fits: list[int]) -> None:
+    source = capture()
+    rig = source.rig.mapped({name: replace(camera, near=1e4) for name, camera in source.rig.cameras.items()})
+    with pytest.raises(CalibrationError, match="near plane lies at .* times the rig's radius, by default at 0.12"):
+        run(replace(source, rig=rig), MemorySink(), config=PRESETS["tiny"])
 
 
 def test_resuming_gives_the_bytes_of_an_uninterrupted_run(quick_fits: list[int], tmp_path: Path) -> None:

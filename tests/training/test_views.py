@@ -93,6 +93,15 @@ def test_absent_cameras_have_no_view_and_shift_no_index() -> None:
     assert left.index == 1
 
 
+def test_views_of_arrays_that_count_backwards() -> None:
+    """As from OpenCV's order of channels to red, green, blue."""
+    stored = np.random.default_rng(0).integers(0, 256, (32, 48, 3), np.uint8)
+    frame = MultiViewFrame(0, 0.0, {"cam02": stored[..., ::-1]}, {"cam02": (stored[..., 0] > 9)[::-1]})
+    (view,) = training_views(frame, RIG, torch.device("cpu"))
+    assert view.mask is not None
+    np.testing.assert_array_equal(view.image.numpy(), np.where(view.mask.numpy()[..., None], stored[..., ::-1], 0))
+
+
 def test_masked_pixels_are_black_and_reduce_to_pixels_that_do_not_count() -> None:
     mask = np.random.default_rng(0).random((32, 48)) > 0.1
     mask[:, 40:] = True

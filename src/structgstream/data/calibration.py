@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import from_numpy
 
-from structgstream.cameras import NEAR_IN_RIG_RADII, Camera, CameraRig, rig_radius
+from structgstream.cameras import NEAR_IN_RIG_RADII, Camera, CameraRig, check_matrices, check_places, rig_radius
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.data.text_files import BROKEN, Unreadable, number, readable, reason
 from structgstream.errors import CalibrationError, CaptureError
@@ -109,6 +109,7 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         if extrinsics.shape == (3, 4):
             extrinsics = np.vstack([extrinsics, [0.0, 0.0, 0.0, 1.0]])
         camera = Camera(from_numpy(extrinsics), from_numpy(intrinsics), width, height)
+        check_matrices(camera)
     except CalibrationError as error:
         raise CalibrationError(f"Camera {name!r} of {where}: {error}") from None
     except BROKEN as error:
@@ -116,11 +117,6 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
             f"Camera {name!r} of {where} has a matrix that cannot be read ({reason(error)}); "
             "expected rows of numbers, a 3x3 K and a 4x4 pose."
         ) from None
-    if not np.allclose(extrinsics[3], [0, 0, 0, 1], atol=1e-6):
-        raise CalibrationError(
-            f"Camera {name!r} of {where}: the last row of its pose is not 0, 0, 0, 1, as of a matrix that is written "
-            "by columns or scaled; expected the translation in the last column."
-        )
     across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height
     # A wrong picture size moves both ratios the same way; a crop seldom does.
     if not (0 < across < 1 and 0 < down < 1) or max(across, down) < 0.3 or min(across, down) > 0.7:
@@ -178,11 +174,10 @@ def check_poses(cameras: Mapping[str, Camera], *, where: Path) -> None:
                 f"{where}: cameras {other!r} and {name!r} have the same pose, as of cameras whose lenses alone were "
                 "calibrated; calibrate where they stand, or leave one out."
             )
-    if len(cameras) > 1 and len({tuple(camera.center.tolist()) for camera in cameras.values()}) == 1:
-        raise CalibrationError(
-            f"{where}: all cameras stand at one place, from which no depth can be seen; expected each with its own "
-            "translation."
-        )
+    try:
+        check_places([*cameras.values()])
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
 
 
 def with_near(rig: CameraRig, near: float) -> CameraRig:
@@ -257,6 +252,8 @@ def check_held_out(held_out: Collection[str], cameras: Collection[str], *, where
     Raises:
         CalibrationError: one is not.
     """
+    if isinstance(held_out, str):
+        raise CalibrationError(f"{where} holds out {held_out!r}; expected a list of names, [{held_out!r}].")
     if unknown := [name for name in held_out if name not in cameras]:
         raise CalibrationError(
             f"{where} holds out {listed(unknown)}, which it does not have; its cameras are {', '.join(cameras)}."

@@ -23,7 +23,7 @@ from structgstream.cameras import enlargement
 from structgstream.data.images import opencv
 from structgstream.data.source import FrameStream, SourceWrapper, closed, is_recording
 from structgstream.errors import CaptureError, ConfigError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import MultiViewFrame, check_pictures
 
 SMOOTHING_PIXELS = 3
 MAX_FRAMES = 256  # sums of 8-bit pictures are 16-bit numbers
@@ -61,6 +61,7 @@ class Denoised(SourceWrapper):
                 yield self._mean(frame) if frame.index in self.at else frame
 
     def _mean(self, frame: MultiViewFrame) -> MultiViewFrame:
+        check_pictures(frame, self.rig, capture=self.name)
         # These frames are read again later: holding all of them would take their pictures' memory.
         with ExitStack() as stack:
             following = frame.index + 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks of a capture of any layout: black pixels do not count.
+"""Masks of a capture of any layout: pixels that are black or transparent do not count.
 
 ::
 
@@ -14,7 +14,7 @@ Live cameras have no numbered frames, so only masks for all frames count.
 
 import logging
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -90,13 +90,14 @@ class MaskedSource(SourceWrapper):
 
 
 def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
-    """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is not black."""
+    """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is neither black nor transparent."""
     cv2 = opencv()
     try:
         data = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
         raise CaptureError(f"The mask {file} cannot be read ({error.strerror}); restore it.") from None
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    # As stored: a conversion to 8 bits would make small numbers of 16, and all that alpha hides, count otherwise.
+    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if picture is None:
         raise CaptureError(f"The mask {file} cannot be decoded ({len(data)} bytes); write it again as PNG.")
     if picture.shape[1::-1] != size:
@@ -104,7 +105,14 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
             f"The mask {file} has {picture.shape[1]}x{picture.shape[0]} pixels, the pictures of camera {camera!r} have "
             f"{size[0]}x{size[1]}; a mask is of the picture as it is shown, before undistortion."
         )
-    return picture.any(axis=2)
+    channels = picture.reshape(*picture.shape[:2], -1)
+    return channels[..., :3].any(axis=2) & channels[..., 3:].all(axis=2)
+
+
+def masks_folder(path: Path) -> Path:
+    """Where the masks of the capture or the videos in ``path`` lie, however the folder is capitalised."""
+    found = (entry for entry in sorted(path.iterdir()) if entry.is_dir() and entry.name.lower() == FOLDER)
+    return next(found, path / FOLDER)
 
 
 def with_masks(source: FrameSource, folder: Path, *, without: Collection[str] = ()) -> FrameSource:
@@ -113,8 +121,8 @@ def with_masks(source: FrameSource, folder: Path, *, without: Collection[str] = 
     ``without`` are names of cameras that the source leaves out, whose masks are not used.
     """
     found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
-    entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
-    entries = [entry for entry in entries if name_of(entry) not in without]
+    entries = [entry for entry in found if not is_hidden(entry) and name_of(entry) not in without]
+    entries = [entry for entry in entries if entry.is_dir() or _is_mask(entry, cameras=source.rig.cameras)]
     if not len(source) and (single := [entry.name for entry in entries if entry.is_dir()]):
         log.warning("%s: the masks of single frames of %s are not used: it is live", source.name, listed(single))
         entries = [entry for entry in entries if not entry.is_dir()]
@@ -150,9 +158,10 @@ def _masks(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.iterdir()) if file.is_file() and not is_hidden(file) and _is_mask(file)]
 
 
-def _is_mask(file: Path) -> bool:
+def _is_mask(file: Path, *, cameras: Container[str] = ()) -> bool:
+    """Whether a file is a PNG; what else a mask may be, as a video of a camera's name, is refused."""
     suffix = file.suffix.lower()
-    if suffix in PICTURE_SUFFIXES - {".png"}:
+    if suffix != ".png" and (suffix in PICTURE_SUFFIXES or name_of(file) in cameras):
         raise CaptureError(f"The mask {file} is no PNG; write it as one, because other formats change what is black.")
     return suffix == ".png"
 
@@ -165,17 +174,21 @@ def lasting_mask(folder: Path, name: str) -> Path | None:
 def _files(folder: Path, name: str, source: FrameSource, own: Path | None) -> CameraMasks:
     """The mask files of a camera, the first of which is checked; those of single frames lie in ``own``."""
     always, files = lasting_mask(folder, name), {} if own is None else by_stem(_masks(own))
-    numbers = _frame_numbers(source, name) if files else {}
+    entries = [] if own is None else [entry for entry in sorted(own.iterdir()) if not is_hidden(entry)]
+    numbers = _frame_numbers(source, name) if entries else {}
     is_named = isinstance(innermost(source), ImageSource)  # frames of videos have no names
     if not is_named:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
-    if files and not frames:
+    others = [file for stem, file in files.items() if stem not in numbers]
+    if frames and others:
+        log.warning("%d masks in %s are of no frame of the capture, such as %s", len(others), own, others[0].name)
+    if entries and not frames:
         expected = "000000.png, the frame's number in the video, from 0"
         if is_named:
             expected = f"{next(iter(numbers), '000000')}.png"
         raise CaptureError(
-            f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
+            f"None of the masks in {own} is of a frame of the capture, such as {entries[0].name}; "
             f"expected names such as {expected}."
         )
     size = (source.rig[name].width, source.rig[name].height)

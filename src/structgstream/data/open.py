@@ -29,7 +29,7 @@ from typing import Literal
 
 import numpy as np
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, check_rig
 from structgstream.data import transforms
 from structgstream.data.calibration import Calibration, alignment, with_near
 from structgstream.data.calibration_files import tools
@@ -58,7 +58,7 @@ from structgstream.data.dataset_layouts import (
     open_panoptic,
 )
 from structgstream.data.images import PICTURE_SUFFIXES
-from structgstream.data.masks import FOLDER, with_masks
+from structgstream.data.masks import masks_folder, with_masks
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, read_prepared, recognizes_prepared
 from structgstream.data.roving import with_roving
@@ -321,7 +321,12 @@ class Uncalibrated(CaptureError):
 
 def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
     try:
-        return with_masks(opens(folder), folder / FOLDER)
+        source = opens(folder)
+        try:
+            check_rig(source.rig)
+        except CalibrationError as error:
+            raise CalibrationError(f"{folder}: {error}") from None
+        return with_masks(source, masks_folder(folder))
     except NoFrames:
         if (above := _above(folder)) is None:
             raise

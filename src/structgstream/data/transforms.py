@@ -22,6 +22,7 @@ import numpy as np
 from structgstream.data.calibration import Calibration, PosedCamera, calibration_of, intrinsics
 from structgstream.data.images import PICTURE_SUFFIXES, picture_size
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.data.masks import masks_folder
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import (
@@ -50,12 +51,14 @@ FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture of a file of transforms: its camera, where it lies, when it was taken and whether it is held out."""
+    """A picture of a file of transforms: its camera, where it lies, when it was taken, whether it is held out, and
+    whether the file names a mask of it."""
 
     camera: PosedCamera
     file: Path
     time: float | None
     held_out: bool
+    masked: bool
 
 
 def find(folder: Path) -> tuple[Path, ...]:
@@ -84,20 +87,20 @@ def _shots_of(file: Path) -> list[Shot]:
         content = mapping(read_json(file))
         frames = [{**content, **mapping(frame)} for frame in content["frames"]]
         entries = [(str(frame["file_path"]), frame) for frame in frames]
-    if any(frame.get("mask_path") for frame in frames):
-        log.warning(
-            "%s: the pictures of mask_path are not read; masks lie in masks/CAMERA.png, black does not count", file
-        )
     pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
-    taken: list[tuple[Path, float | None]] = []
+    taken: list[tuple[Path, float | None, bool]] = []
 
     def camera(name: str, frame: dict[str, Any]) -> PosedCamera:
         picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
-        taken.append((picture, None if frame.get("time") is None else number(frame["time"])))
+        time = None if frame.get("time") is None else number(frame["time"])
+        taken.append((picture, time, frame.get("mask_path") is not None))
         return _camera(name, frame, picture, file)
 
     cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
-    return [Shot(posed, *own, file.name == TEST) for posed, own in zip(cameras, taken, strict=True)]
+    return [
+        Shot(posed, picture, time, file.name == TEST, masked)
+        for posed, (picture, time, masked) in zip(cameras, taken, strict=True)
+    ]
 
 
 def stated_fps(file: Path) -> float | None:
@@ -164,6 +167,8 @@ def open_transforms(path: Path) -> FrameSource:
     """The capture at ``path``; what ``transforms_test.json`` lists is held out."""
     files = find(path)
     shots = read_shots(files)
+    if any(shot.masked for shot in shots) and not masks_folder(path).is_dir():
+        log.warning("%s names masks (mask_path), which are not read; copy them to masks/CAMERA/FRAME.png", files[0])
     if files[0].name == WHOLE and any(shot.time is None for shot in shots):
         return open_posed(path, read(files), fps=stated_fps(files[0]))
     cameras = _by_pose(shots, files[0])

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import MAX_SKEW_PIXELS, Camera, CameraRig, skew_pixels
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource, SourceWrapper, WithRig
@@ -28,14 +28,12 @@ WIDEST_DEGREES = 110.0
 """Across the longer side. A rectilinear picture is stretched 3 times at the edge of 110 degrees, 15 times of 150."""
 BORDER_SAMPLES = 129
 SLACK_PIXELS = 0.01  # by which a sampled border may leave the picture
-SKEW_PIXELS = 0.1  # by which rows may be shifted in a picture that is taken for one of a camera without skew
 
 
 def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple[int, int] | None = None) -> Camera:
     """The pinhole that pictures of a lens can be resampled for, with square pixels.
 
-    Without distortion and skew, of which no other module knows, the camera itself, unless ``degrees`` or ``size`` is
-    given.
+    Without distortion and skew the camera itself, unless ``degrees`` or ``size`` is given.
 
     Args:
         degrees: field of view across the picture's width, around the optical axis; None for the largest that the lens
@@ -49,8 +47,7 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
     width, height = (filmed.camera.width, filmed.camera.height) if size is None else size
     if min(width, height) < 1:
         raise ConfigError(f"A picture of {width}x{height} pixels cannot be made; give a positive width and height.")
-    skew = abs(float(filmed.camera.K[0, 1] / filmed.camera.K[1, 1])) * height / 2  # pixels, at the picture's border
-    if degrees is None and isinstance(filmed.lens, Pinhole) and skew < SKEW_PIXELS:
+    if degrees is None and isinstance(filmed.lens, Pinhole) and skew_pixels(filmed.camera) <= MAX_SKEW_PIXELS:
         return filmed.camera.resized(width, height)
     if degrees is not None:
         check_field_of_view(degrees)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from structgstream.cameras import Camera
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind
 from structgstream.data.source import FrameSource, select_cameras
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
 from structgstream.evaluation.metrics import (
@@ -150,6 +150,8 @@ def evaluate(
         ConfigError: there is no camera to score, or weights for LPIPS are wrong.
         StreamError: a packet is damaged.
     """
+    if metrics not in get_args(MetricSelection):
+        raise ConfigError(f"metrics is one of {', '.join(get_args(MetricSelection))}; got {metrics!r}.")
     names = scored_cameras(recording.header, cameras)
     check_same_rig(recording.header, source, names)
     check_same_frames(recording, source)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings that can be evaluated (one drawable per frame, of this method or another), and the captures of streams."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -8,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, rig_radius
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
@@ -21,6 +22,8 @@ from structgstream.evaluation.report import FrameScores
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
+
+log = logging.getLogger(__name__)
 
 
 class Recording(Protocol):
@@ -111,8 +114,10 @@ def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> Fram
 def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
     """The cameras to score: the named ones, or all that were held out. Raises ConfigError if a name is unknown, or no
     camera was held out and none is named."""
-    if cameras is None:
-        if not header.rig.testing:
+    if isinstance(cameras, str):
+        raise ConfigError(f"cameras takes a list of names, as ({cameras!r},); got {cameras!r}.")
+    if not cameras:
+        if cameras is not None or not header.rig.testing:
             raise ConfigError(
                 "The stream has no held-out camera to score; name cameras with --cameras (trained ones), "
                 "or reconstruct with --held-out."
@@ -123,9 +128,17 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
     return tuple(dict.fromkeys(cameras))
 
 
+SAME_POSE = 1e-4
+"""Largest difference of poses that count as equal: of rotation matrices, and of positions in radii of the rig, since
+units are as small as millimetres of a desk, and coordinates as large as those of maps."""
+
+
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
     """Check that the capture's cameras of these names are equal to those of the stream. Raises CaptureError if one is
-    missing, or has another calibration or picture size."""
+    missing, or has another calibration or picture size; a capture of another name is reported."""
+    made = header.metadata.get("capture", source.name)
+    if made != source.name:
+        log.warning("The stream was made from the capture %r, and is compared with %r", made, source.name)
     for name in names:
         ours = header.rig[name]
         theirs = source.rig.cameras.get(name)
@@ -140,7 +153,9 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
                 f"{ours.width}x{ours.height} in the stream; evaluate the stream on the capture it was made from, "
                 "opened at the same scale."
             )
-        if not (torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4) and torch.allclose(theirs.K, ours.K, atol=0.1)):
+        turned = (theirs.viewmat[:3, :3] - ours.viewmat[:3, :3]).abs().max()
+        moved = (theirs.center - ours.center).norm() / rig_radius(header.rig)
+        if max(turned, moved) > SAME_POSE or not torch.allclose(theirs.K, ours.K, atol=0.1):
             raise CaptureError(
                 f"Camera {name!r} of the capture {source.name} has another calibration than in the stream; "
                 "evaluate the stream on the capture it was made from."

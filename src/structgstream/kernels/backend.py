@@ -224,12 +224,14 @@ def select_backend(name: BackendName | Backend) -> Backend:
         name: its name; a :class:`Backend` is returned as it is.
 
     Raises:
-        BackendError: the named one is not available; the message states why and how to get it.
+        BackendError: the named one does not exist or is not available; the message states why and how to get it.
     """
     if isinstance(name, Backend):
         return name
     builders = {"cuda": cuda_backend, "cpu": cpu_backend, "reference": reference_backend}
     if name != "auto":
+        if name not in builders:
+            raise BackendError(f"There is no back-end {name!r}; there are auto, {', '.join(builders)}.")
         return builders[name]()
     reasons = backend_reasons()
     if reasons["cuda"] is not None and reasons["cpu"] is not None:

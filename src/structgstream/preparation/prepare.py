@@ -18,6 +18,7 @@ from structgstream.cameras import NEAR_IN_RIG_RADII, CameraRig, rig_radius
 from structgstream.data.calibration import Calibration, listed
 from structgstream.data.camera_files import REPORT
 from structgstream.data.masks import FOLDER as MASKS
+from structgstream.data.masks import masks_folder
 from structgstream.data.open import best_surrounded, open_capture
 from structgstream.data.prepared import (
     ROVING,
@@ -272,7 +273,7 @@ class Job:
 
     def _link_masks(self) -> None:
         """All masks but those of cameras that are left out; these are removed where an earlier run linked them."""
-        folder = self.videos / MASKS
+        folder = masks_folder(self.videos)
         for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
             target = self.capture / MASKS / entry.name
             if (entry.name if entry.is_dir() else entry.stem) in self.options.without:

@@ -14,7 +14,7 @@ from typing import Generic
 
 import torch
 
-from structgstream.cameras import CameraRig, Similarity, normalizing_similarity
+from structgstream.cameras import CameraRig, Similarity, check_rig, normalizing_similarity
 from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
@@ -23,8 +23,9 @@ from structgstream.data.denoising import denoised
 from structgstream.data.points import PointsConfig
 from structgstream.data.roving import frame_points, roving_of
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
+from structgstream.data.timeline import check_rate
 from structgstream.errors import CaptureError, ConfigError, StorageError
-from structgstream.frames import MIN_CAMERAS, MultiViewFrame, RovingPicture
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame, RovingPicture, check_pictures
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.session.frame_report import FrameReport, metered
@@ -59,8 +60,9 @@ class Session(Generic[State, Memory]):
         on_step: called after every optimisation step.
 
     Raises:
-        CalibrationError: the pictures of a camera are larger than a stream allows.
-        ConfigError: the stream to resume was made with another configuration or from another capture.
+        CalibrationError: the pictures of a camera are larger than a stream allows, or it cannot be drawn as calibrated.
+        ConfigError: the source has no rate, or the stream to resume was made with another configuration or from
+            another capture.
     """
 
     def __init__(
@@ -75,6 +77,8 @@ class Session(Generic[State, Memory]):
         on_step: StepListener | None = None,
     ) -> None:
         check_picture_sizes(source.rig)
+        check_rig(source.rig)
+        check_rate(source.fps)
         self._source = denoised(source, pipeline.denoising, at=pipeline.denoised)
         self._sink = sink
         self._pipeline = pipeline
@@ -148,7 +152,13 @@ class Session(Generic[State, Memory]):
         before = None
         if again:
             before = training_views(self._showing_from(next(frames)), self._rig, self._backend.device)
-        for frame in frames:
+        for index, frame in enumerate(frames, start):
+            if frame.index != index:
+                raise CaptureError(
+                    f"{self._source.name} gives frame {frame.index} where frame {index} belongs; frames count from 0, "
+                    "in steps of 1."
+                )
+            check_pictures(frame, self._rig, capture=self._source.name)
             check_enough_pictures(frame, self._rig, self._source.name)
             pictures = method.observe(frame, before, rig=self._rig, backend=self._backend)
             yield frame, pictures
@@ -355,6 +365,8 @@ def initial_points_of(
     given = source.points if frame.index == 0 else None
     if given is None:
         given = frame_points(source, frame, config=config, seed=seed)
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise CaptureError(f"The points of {source.name} have shape {given.shape}; expected [P, 3], positions alone.")
     return similarity.points(torch.from_numpy(given))
 
 

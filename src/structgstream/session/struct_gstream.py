@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import NEAR_IN_RIG_RADII, CameraRig
 from structgstream.codec.fields.quantization import float32, round_to_bins
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
@@ -116,9 +116,11 @@ class SceneCodec:
         """The quantization steps of packets, by parameter."""
         pixel = pixel_size(scene.anchors.positions, [rig[name] for name in rig.training])
         if pixel is None:
+            near = max(rig[name].near for name in rig.training) / StreamConfig.NORMALISED_RADIUS
             raise CalibrationError(
-                "No training camera sees an anchor of frame 0, so positions have no step; check the calibration with "
-                "structgstream prepare --check."
+                "No training camera sees an anchor of frame 0, so positions have no step. The near plane lies at "
+                f"{near:.3g} times the rig's radius, by default at {NEAR_IN_RIG_RADII:g}: choose another --near, or "
+                "check the calibration with structgstream prepare --check."
             )
         used = {parameter.name for parameter in parameters_of(self.config.online.dynamic)}
         known = self.config.online.rounding.steps(pixel)

@@ -79,7 +79,8 @@ class View:
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
     """The frame's training views in rig order, without absent cameras; held-out pictures are not read."""
     rows, names = {name: i for i, name in enumerate(rig.training)}, frame.showing(rig.training)
-    images = [torch.from_numpy(frame.images[name]) for name in names]
+    # Torch does not take views that count backwards, as OpenCV's pictures[..., ::-1].
+    images = [torch.from_numpy(np.ascontiguousarray(frame.images[name])) for name in names]
     if device.type != "cpu":
         images = in_groups(images, lambda image: image.shape, lambda same: torch.stack(same).to(device), device=device)
     return [_view(rows[n], rig[n], image, frame.masks.get(n)) for n, image in zip(names, images, strict=True)]
@@ -88,7 +89,7 @@ def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) 
 def _view(index: int, camera: Camera, image: Tensor, mask: NDArray[np.bool_] | None) -> View:
     if mask is None or mask.all():
         return View(index, camera, image)
-    counts = torch.from_numpy(mask).to(image.device)
+    counts = torch.from_numpy(np.ascontiguousarray(mask)).to(image.device)
     return View(index, camera, blackened(image, counts), counts)
 
 

@@ -33,7 +33,7 @@ def prepared(folder: Path) -> PreparedCapture:
 def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
     capture, path = prepared(tmp_path), tmp_path / "rig.toml"
     filmed = filmed_rig(tmp_path, capture)
-    path.write_text('calibration = "."\n' + "".join(f'[cameras.{name}]\nurl = "udp://nowhere"\n' for name in filmed))
+    path.write_text('calibration = "."\n' + "".join(f'[cameras.{name}]\nurl = "udp://{name}"\n' for name in filmed))
     random = np.random.default_rng(0)
     images = {
         name: random.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)

@@ -108,6 +108,7 @@ def test_little_is_needed(tmp_path: Path) -> None:
         ('options = {rtsp_transport = "tcp"}', "options = {timeout = 5}", "a table of texts"),
         ("[cameras.a]", "[camera.a]", "no key 'camera'"),
         ("[cameras.b]", "[cameras.a]", "cannot be read"),
+        ("[cameras.b]", '[cameras.d]\nurl = "take/b.ts"\nfollow = true\n[cameras.b]', "'d' and 'b' of .* have one url"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:

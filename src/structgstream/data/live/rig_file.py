@@ -94,6 +94,10 @@ def read_rig(path: Path) -> LiveRig:
     if not isinstance(entries, dict) or not entries:
         raise CaptureError(f"The rig file {path} has no cameras; give each a table [cameras.NAME] with its url.")
     cameras = {name: _parse(LiveCamera, entry, where=f"camera {name!r} of {path}") for name, entry in entries.items()}
+    sources: dict[str, str] = {}
+    for name, camera in cameras.items():
+        if (other := sources.setdefault(repr(replace(camera, offset_seconds=0.0)), name)) != name:
+            raise CaptureError(f"Cameras {other!r} and {name!r} of {path} have one url; give each its own.")
     settings = {"name": path.stem, **content, "cameras": cameras}
     rig = _parse(LiveRig, settings, where=f"the rig file {path}")
     return _resolved(rig, path)

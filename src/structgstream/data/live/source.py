@@ -22,7 +22,7 @@ from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, r
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import CameraStatus, Fault, FaultLog, LiveStatus
 from structgstream.data.live.synchronizer import PictureSet
-from structgstream.data.masks import FOLDER, with_masks
+from structgstream.data.masks import masks_folder, with_masks
 from structgstream.data.open import open_capture, selected
 from structgstream.data.prepared import (
     PreparedCamera,
@@ -254,7 +254,7 @@ class LiveSource:
         """Pictures as they arrive, undistorted and masked as those of the calibration's capture are."""
         options, folder = self._options, self._live.calibration
         pictures = undistorted(LivePictures(self.name, self._filmed, self.fps, arriving), folder, self._calibration)
-        source = with_masks(pictures, folder / FOLDER, without=self._live.without)
+        source = with_masks(pictures, masks_folder(folder), without=self._live.without)
         return selected(source, held_out=options.held_out, scale=options.scale, near=options.near)
 
     def _arriving(self, ingest: Ingest, *, is_first: bool) -> Iterator[MultiViewFrame]:
@@ -296,7 +296,7 @@ class LiveSource:
     def _running(self) -> Iterator[tuple[Ingest, Recording | None]]:
         recording = None
         if self._options.record is not None:
-            masks = self._live.calibration / FOLDER
+            masks = masks_folder(self._live.calibration)
             recording = Recording(self._options.record, self._calibration, fps=self.fps, masks=masks)
         ingest = self._ingest = Ingest(
             self._live,

@@ -66,7 +66,8 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
     for group in ([single] if single else []) + [group for group in others if len(group) > 1]:
         sentence = (
             f"The pictures of {listed(group)} have no matches with those of the others, so their poses are not "
-            "checked; move them closer to the others, or film a calibration board there."
+            "checked; black, blurred and mirrored ones match nothing, so look at them in the report. Else move the "
+            "cameras closer to the others, or film a calibration board there."
         )
         findings.append(Finding("warning", sentence, tuple(group)))
     for name, count in overlaps(pairs, names).items():
