@@ -10,7 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.atomic_files import atomic_file, atomic_write, give_name, partial_path, replacing, sync_folder
+from structgstream.atomic_files import (
+    GrowingFile,
+    atomic_file,
+    atomic_write,
+    give_name,
+    partial_path,
+    remove_unused,
+    replacing,
+    sync_folder,
+)
 from structgstream.errors import StorageError
 from tests.support.killed import folders_of_the_killed
 
@@ -229,3 +238,20 @@ def test_who_opens_while_another_gives_the_name_does_not_write_into_the_finished
     assert not wrong
     assert path.read_bytes() in contents
     assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+
+
+def test_what_another_process_writes_is_not_removed(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(OLD)
+    file = GrowingFile(path)
+    file.append(NEW)
+    with pytest.raises(StorageError, match="Another process writes"):
+        remove_unused(path)
+    assert (path.read_bytes(), partial_path(path).read_bytes()) == (OLD, NEW)
+    file.close()
+    remove_unused(path)
+    remove_unused(path)
+    assert not [*tmp_path.iterdir()]
+    path.mkdir()
+    with pytest.raises(StorageError, match="cannot be replaced .*; choose another name"):
+        remove_unused(path)

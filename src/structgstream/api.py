@@ -23,7 +23,7 @@ from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.recording import captures_of, part_metadata
 from structgstream.evaluation.report import Report
-from structgstream.evaluation.run_log import read_log
+from structgstream.evaluation.run_log import log_of
 from structgstream.exporters.formats import Format, FrameOptions, PageFormat, check_page, choose_frames, destination
 from structgstream.exporters.write import write_frames
 from structgstream.kernels.backend import Backend, BackendName, select_backend
@@ -255,7 +255,7 @@ def evaluate(
             capture,
             backend=select_backend(backend),
             cameras=cameras,
-            log=read_log(Path(path)),
+            log=log_of(Path(path), {info.index: info.bytes for info in reader.packets}),
             metrics=metrics,
             lpips_weights=lpips_weights,
             stored=stored,

@@ -53,13 +53,14 @@ def open_lockable(path: Path, *, buffering: int = -1) -> BinaryIO:
 
 _WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EBADF, errno.ENOSYS)
 """Errors of file systems that cannot sync a folder, and of folders without read permission."""
-_ADVICE = {
+ADVICE = {
     errno.ENOSPC: "; make room",
     errno.EDQUOT: "; make room",
     errno.EACCES: "; correct its permissions, or choose another place",
     errno.EPERM: "; correct its permissions, or choose another place",
     errno.EROFS: "; choose another place",
 }
+"""What to do about a file that cannot be written, by the error of the system."""
 
 
 def partial_path(path: Path) -> Path:
@@ -154,7 +155,8 @@ def renamed_on_success(path: Path) -> Iterator[Path]:
         with _as_storage_error(path, ""):
             give_name(partial, path)
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
@@ -212,7 +214,7 @@ def _as_storage_error(path: Path, called: str) -> Iterator[None]:
     except OSError as error:
         reason = f"{path.parent} is a file" if os.path.isfile(path.parent) else error.strerror or str(error)
         name = f"{called} {path}".lstrip()
-        raise StorageError(f"{name} cannot be written ({reason}){_ADVICE.get(error.errno or 0, '')}.") from error
+        raise StorageError(f"{name} cannot be written ({reason}){ADVICE.get(error.errno or 0, '')}.") from error
 
 
 def name_finished(path: Path) -> None:
@@ -220,6 +222,19 @@ def name_finished(path: Path) -> None:
     renamed, or another process writes it."""
     partial = partial_path(path)
     GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
+
+
+def remove_unused(path: Path) -> None:
+    """Removes a file and its partial file, if they exist. Raises StorageError if another process writes it, which would
+    otherwise give the next writer's partial file its name, or it cannot be removed."""
+    partial = partial_path(path)
+    try:
+        if partial.exists():
+            with open_exclusive(partial, of=path):
+                partial.unlink()
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise StorageError(f"{path} cannot be replaced ({error.strerror}); choose another name.") from error
 
 
 def append_durably(file: BinaryIO, data: bytes, *, end: int) -> None:
@@ -240,7 +255,7 @@ def append_durably(file: BinaryIO, data: bytes, *, end: int) -> None:
 
 class GrowingFile:
     """A locked file that grows under the name ``PATH.partial``, after ``keep`` existing bytes, and is renamed at the
-    end.
+    end. A missing folder is created.
 
     Data is on the disk when :meth:`append` returns; a failed write is truncated. Raises StorageError if it cannot be
     written, another process writes it, or has changed it since ``keep`` was found.
@@ -249,6 +264,7 @@ class GrowingFile:
     def __init__(self, path: Path, *, keep: int = 0) -> None:
         self.path, self.partial = path, partial_path(path)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open_exclusive(self.partial, of=path, buffering=0)
             try:
                 self._begin(keep)

@@ -128,8 +128,10 @@ def test_what_came_and_went_is_reported_where_the_log_is(
     stream.write_bytes(streams["raw"].read_bytes())
     assert not any(words[:1] == ["came,"] for words in shown([str(stream)], capsys))
     begin_log(stream)
-    append_log(stream, {"index": 0, "grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0})
-    append_log(stream, {"index": 2, "grown": 0, "removed": 0, "spawned": 5, "pruned": 4})
+    with open_stream(stream) as reader:
+        sizes = [info.bytes for info in reader.packets]
+    append_log(stream, {"index": 0, "bytes": sizes[0], "grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0})
+    append_log(stream, {"index": 2, "bytes": sizes[2], "grown": 0, "removed": 0, "spawned": 5, "pruned": 4})
     output = tmp_path / "out.json"
     lines = shown([str(stream), "--json", str(output)], capsys)
     reported = " ".join(next(words for words in lines if words[:1] == ["came,"]))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``parallel`` on the bundled clip, and what it says when something is wrong."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from structgstream.cli import main, parallel
 from structgstream.cli.options import CaptureOptions, Device
-from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments
+from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments, parts_folder
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
 from structgstream.executors.tasks import ExecutorOptions, TaskQueue, TaskResult, open_executor
@@ -18,6 +19,7 @@ from structgstream.parallel.parts import PURPOSE, Parts
 from tests.support.backends import QUICKEST
 from tests.support.inline_engine import InlineEngine
 from tests.support.quick_streams import CLIP, QUARTER, error_of
+from tests.support.streams import small_stream
 
 GROUPS = ["--frames", "4", "--groups", "2", "--allow-unaligned"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
@@ -108,6 +110,17 @@ def test_an_output_that_is_no_parallel_run_is_not_replaced(tmp_path: Path, capsy
     assert (tmp_path / "out.sgs").read_bytes() == b"mine"
 
 
+def test_another_stream_that_was_written_after_the_run_is_not_replaced(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts, out = parts_folder(stream), tmp_path / "out.sgs"
+    shutil.copytree(parts, parts_folder(out))
+    out.write_bytes(small_stream())
+    error = error_of(["parallel", CLIP, "-o", str(out), *GROUPS, *QUARTER], capsys, status=1)
+    assert f"out.sgs is not the stream that was joined from {parts_folder(out)}" in error
+    assert out.read_bytes() == small_stream()
+
+
 def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -142,6 +155,7 @@ def test_folders_and_stores_of_others_are_refused_with_every_option_and_nothing_
         with parts.locked():
             parts.header.write_bytes(b"mine")
             parts.record(TaskResult("header", 0, 1.0), "key", parts.header, frames=1)
+            parts.record(TaskResult("join", 0, 1.0), "key", output, frames=1)
     (store / "segments").mkdir()
     (store / "segments" / "group-000000-000004.sgs").write_bytes(b"mine")
     if whose in ("ours", "other run"):

@@ -86,6 +86,7 @@ def test_a_probe_is_a_short_run_with_the_same_options(
 
     def command(words: list[str]) -> int:
         given.append(words)
+        (tmp_path / "probe").mkdir()
         Path(parts).rename(tmp_path / "probe" / "probe.sgs.parts")
         return 0
 
@@ -110,3 +111,10 @@ def test_the_status_of_a_probe_that_fails_is_that_of_plan(
     real = app.main
     monkeypatch.setattr(app, "main", lambda words: status)
     assert real(["plan", CLIP, "-o", str(tmp_path / "probe"), "--preset", "tiny"]) == status
+
+
+def test_a_probe_whose_folder_cannot_be_made_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    error = error_of(["plan", CLIP, "-o", str(tmp_path / "file" / "probe"), "--preset", "tiny"], capsys, status=1)
+    assert "cannot be" in error
+    assert "unexpected" not in error

@@ -105,6 +105,7 @@ def test_overwrite_removes_what_is_there_and_nothing_else_does(
     for each in there:
         each.write_bytes(b"before")
     assert main([*words, "--cameras", "1"]) == 2
+    assert main([*words, "--overwrite", "--after", "absent.sgs"]) == 1
     assert all(each.read_bytes() == b"before" for each in there)
     assert main([*words, "--overwrite"]) == 130
     assert not path.exists()

@@ -99,7 +99,10 @@ def test_another_major_version_is_refused_and_a_newer_minor_is_not() -> None:
 @pytest.mark.parametrize(
     ("records", "message"),
     [
-        ([packet_record(1, PacketKind.KEY)], "has packet 1 where packet 0 belongs"),
+        (
+            [packet_record(1, PacketKind.KEY)],
+            r"has packet 1 where packet 0 belongs\. If structgstream fit-group wrote it, join it",
+        ),
         ([packet_record(0, PacketKind.DELTA)], "begins with a delta packet"),
         ([packet_record(0, PacketKind.KEY), packet_record(0, PacketKind.KEY)], "packet 0 where packet 1 belongs"),
         (

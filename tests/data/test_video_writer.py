@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A written video plays, with the right colours, or is not there."""
 
+import errno
+import os
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 
+from structgstream.atomic_files import partial_path
 from structgstream.data.video_writer import VideoWriter
 from structgstream.errors import StorageError
 
@@ -67,6 +70,25 @@ def test_an_error_leaves_no_half_written_file(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stop"):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_refuses_is_said_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk, and a read-only one, which refuses to remove a file that is not there, too."""
+    if not os.access("/dev/full", os.W_OK):
+        pytest.skip("this system has no /dev/full")
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    partial_path(tmp_path / "v.mp4").symlink_to("/dev/full")
+    monkeypatch.setattr(Path, "unlink", refused)
+
+    def full() -> None:
+        with VideoWriter(tmp_path / "v.mp4", fps=30) as video:
+            video.write(gradient(0))
+
+    with pytest.raises(StorageError, match=r"v\.mp4 cannot be written \(No space left on device\); make room\.$"):
+        full()
 
 
 def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:

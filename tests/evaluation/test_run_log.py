@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.evaluation.run_log import append_log, begin_log, log_path, read_log
+from structgstream.evaluation.run_log import append_log, begin_log, log_of, log_path, read_log
 from tests.support.killed import folders_of_the_killed
 
 
@@ -74,3 +74,18 @@ def test_a_stream_that_was_renamed_with_its_log_goes_on(tmp_path: Path) -> None:
     log_path(tmp_path / "ball.sgs").rename(log_path(tmp_path / "best.sgs"))
     begin_log(tmp_path / "best.sgs", frames=1)
     assert list(read_log(tmp_path / "best.sgs")) == [0]
+
+
+def test_the_log_of_a_stream_that_was_there_before_is_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A joined stream gets the name of a reconstructed one, and the frame 0 of both has as many bytes."""
+    path = tmp_path / "a.sgs"
+    begin_log(path)
+    for index, size in enumerate([83, 500, 600]):
+        append_log(path, {"index": index, "bytes": size})
+    assert log_of(path, {0: 83, 1: 500}) == read_log(path)
+    assert not caplog.messages
+    assert log_of(path, {0: 83, 1: 500, 2: 601}) == {}
+    sentence = f"a.log.jsonl is not used: its frames have other sizes than those of {path}, so it is of another run"
+    assert caplog.messages == [f"{tmp_path}/{sentence}"]

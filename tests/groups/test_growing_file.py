@@ -42,3 +42,11 @@ def test_what_another_process_has_finished_meanwhile_is_not_cut_off(tmp_path: Pa
         with pytest.raises(StorageError, match="Another process has changed"):
             GrowingFile(path, keep=2)
     assert path.read_bytes() == b"one"
+
+
+def test_its_folder_is_created_or_reported(tmp_path: Path) -> None:
+    GrowingFile(tmp_path / "new" / "folder" / "a").close()
+    assert partial_path(tmp_path / "new" / "folder" / "a").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="cannot be written"):
+        GrowingFile(tmp_path / "file" / "a")

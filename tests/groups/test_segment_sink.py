@@ -130,6 +130,14 @@ def test_another_group_is_refused_and_kept(
     assert there.read_bytes() == (whole if finished else whole[:-30])
 
 
+def test_a_stream_of_this_name_is_refused_and_kept(tmp_path: Path) -> None:
+    path, stream = tmp_path / "header.sgs", base().init + base().first
+    path.write_bytes(stream)
+    with pytest.raises(ConfigError, match=r"header\.sgs is a stream, not a segment of one; choose another name"):
+        resume_segment(path, base(), IDENTITY)
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == {path.name: stream}
+
+
 def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "g.sgs"
     sink = SegmentSink(path, base(), IDENTITY, None)

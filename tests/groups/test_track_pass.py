@@ -91,3 +91,10 @@ def test_after_a_finished_group_it_begins_where_that_has_fitted_things(tmp_path:
     assert track(path, made().header, options=options, stop_after=1) == 1
     track(path, made().header, options=options)
     assert path.read_bytes() == whole
+
+
+def test_a_group_that_ends_with_the_frames_has_none_after_it(tmp_path: Path) -> None:
+    options = replace(OPTIONS, after=open_segment(made().segments[2]))
+    with pytest.raises(ConfigError, match=r"has the frames to before 6, and 6 frames are to be tracked, so none is"):
+        track(tmp_path / "track", made().header, options=options)
+    assert not [*tmp_path.iterdir()]

@@ -43,6 +43,8 @@ def test_what_differs_is_named() -> None:
         metadata={**METADATA, "start": 2}
     )
     assert "another part of it: fps differ" in refused(fps=25.0)
+    renamed = refused(metadata={**METADATA, "capture": "renamed"})
+    assert f"capture and options (in the stream: capture {METADATA['capture']!r}), or start again" in renamed
 
 
 def test_every_fact_of_a_camera_counts() -> None:

@@ -117,7 +117,7 @@ def run_evaluation(
     from structgstream.evaluation.pictures import contact_sheet, spread_indices
     from structgstream.evaluation.plots import write_plots
     from structgstream.evaluation.report import as_json, write_json
-    from structgstream.evaluation.run_log import read_log
+    from structgstream.evaluation.run_log import log_of
     from structgstream.evaluation.worst import WorstPictures, write_page
 
     frames = len(reader.packets)
@@ -140,7 +140,7 @@ def run_evaluation(
             source,
             backend=backend,
             cameras=cameras,
-            log=read_log(stream),
+            log=log_of(stream, {info.index: info.bytes for info in reader.packets}),
             observer=observe,
             metrics=metrics,
             lpips_weights=lpips_weights,

@@ -69,7 +69,7 @@ def track(arguments: list[str]) -> None:
     """Tracks with a progress bar, and lists the groups."""
     options = parse_options(Track, "track", arguments=arguments)
     check_ending(options.output, command="track")
-    from structgstream.atomic_files import partial_path
+    from structgstream.atomic_files import remove_unused
     from structgstream.groups.base import GroupBase, open_for
     from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_file import check_length, groups_path
@@ -86,11 +86,10 @@ def track(arguments: list[str]) -> None:
         raise UsageError(f"--cameras must be at least 2, got {options.cameras}.")
     source = open_for(base.header, options.scene, frames=options.frames)
     backend = select_backend(options.device)
-    if options.overwrite:
-        for path in (options.output, partial_path(options.output), groups_path(options.output)):
-            path.unlink(missing_ok=True)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
     after = None if options.after is None else open_segment(options.after)
+    if options.overwrite:
+        remove_unused(options.output)
+        remove_unused(groups_path(options.output))
     chosen = TrackOptions(length, options.split_at_low_motion, after, TrackConfig(cameras=options.cameras))
     spent = _track(options.output, source, base, chosen, backend)
     _say(options.output, len(source), spent)

@@ -79,11 +79,12 @@ def main(arguments: list[str]) -> None:
         return
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.byte_count import packet_rows
-    from structgstream.evaluation.run_log import read_log
+    from structgstream.evaluation.run_log import log_of
 
     with open_stream(options.stream) as reader:
         rows = packet_rows(reader)
-        content = describe_stream(reader, rows, log=read_log(options.stream))
+        log = log_of(options.stream, {row.index: row.bytes for row in rows})
+        content = describe_stream(reader, rows, log=log)
         console = write_json_output(options.json, content)
         if plot is not None:
             draw_byte_plot(plot, reader, rows, name=options.stream.name)

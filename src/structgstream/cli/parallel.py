@@ -145,8 +145,11 @@ def main(arguments: list[str]) -> None:
 
 def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     """Check the options against the capture, and that the output and its parts may be written."""
+    from structgstream.errors import StorageError
     from structgstream.groups.base import check_for_groups
     from structgstream.groups.track_file import check_length
+    from structgstream.parallel.driver import JOIN
+    from structgstream.parallel.parts import sha256_of
     from structgstream.recorder import check_output
     from structgstream.session.struct_gstream import stream_pipeline
 
@@ -156,6 +159,13 @@ def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
         check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
     parts.check()
     check_output(options.output, may_exist=options.overwrite or bool(parts.completed), resume=False)
+    if options.output.exists() and not options.overwrite:
+        joined = parts.completed.get(JOIN)
+        if joined is None or sha256_of(options.output) != joined.sha256:
+            raise StorageError(
+                f"{options.output} is not the stream that was joined from {parts.folder}, so it may be another one; "
+                "move it to another place, and give the same command again."
+            )
 
 
 def parts_folder(output: Path) -> Path:
@@ -382,7 +392,6 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     from structgstream.cli.app import main as command
 
     assert options.output is not None
-    options.output.mkdir(parents=True, exist_ok=True)
     stream = options.output / "probe.sgs"
     probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
     probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1"]

@@ -414,7 +414,8 @@ class Scan:
                 f"period {self._period}."
             )
         if packet.index != len(offsets):
-            raise StreamError(f"{name} has packet {packet.index} where packet {len(offsets)} belongs.")
+            advice = "" if offsets else " If structgstream fit-group wrote it, join it with the groups before it."
+            raise StreamError(f"{name} has packet {packet.index} where packet {len(offsets)} belongs.{advice}")
         begins = packet.index == 0 or (self._pending is not None and broken is None)
         if begins and packet.kind is not PacketKind.KEY:
             what = f"Period {self._period} of {name}" if packet.index else name

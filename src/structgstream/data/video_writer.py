@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes pictures as a widely playable video: H.264 in mp4, 4:2:0, BT.709, constant quality; sound as AAC."""
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.atomic_files import give_name, partial_path
+from structgstream.atomic_files import ADVICE, give_name, partial_path
 from structgstream.data.video import ACCURATE_ROUNDING, BICUBIC, BT709, FULL_RANGE, LIMITED_RANGE
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
@@ -47,7 +47,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
             options = {"crf": "18", "preset": "veryfast"}
             self._stream = self._container.add_stream("libx264", rate=self._fps, options=options)
         except (OSError, ValueError, av.error.FFmpegError) as error:
-            raise StorageError(f"The video {path} cannot be written ({error}).") from None
+            raise self._failed(error) from None
         self._stream.pix_fmt = "yuv420p"
         context = self._stream.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
@@ -105,15 +105,20 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
             if kind is None and self._count:
                 give_name(self._part, self.path)
         except (OSError, self._av.error.FFmpegError) as problem:
-            raise StorageError(f"The video {self.path} cannot be written ({problem.strerror}).") from None
+            raise self._failed(problem) from None
         finally:
-            self._part.unlink(missing_ok=True)
+            with suppress(OSError):  # A read-only disk refuses to remove even what is not there.
+                self._part.unlink(missing_ok=True)
 
     def _mux(self, frame: object, stream: Any = None) -> None:
         try:
             self._container.mux((stream or self._stream).encode(frame))  # pyright: ignore[reportArgumentType]
         except (OSError, self._av.error.FFmpegError) as error:
-            raise StorageError(f"The video {self.path} cannot be written ({error.strerror}).") from None
+            raise self._failed(error) from None
+
+    def _failed(self, error: Exception) -> StorageError:
+        reason, number = getattr(error, "strerror", None) or error, getattr(error, "errno", None)
+        return StorageError(f"The video {self.path} cannot be written ({reason}){ADVICE.get(number or 0, '')}.")
 
 
 def state_bt709(codec_context: Any) -> None:

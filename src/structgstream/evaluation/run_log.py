@@ -8,6 +8,7 @@ refused. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind``
 """
 
 import json
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -19,6 +20,8 @@ from structgstream.errors import StorageError
 
 if TYPE_CHECKING:
     from structgstream.session.frame_report import FrameReport
+
+_log = logging.getLogger(__name__)
 
 
 def log_path(stream: Path) -> Path:
@@ -92,6 +95,20 @@ def read_log(stream: Path) -> dict[int, dict[str, Any]]:
             entries[int(entry["index"])] = entry
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
+    return entries
+
+
+def log_of(stream: Path, sizes: Mapping[int, int]) -> dict[int, dict[str, Any]]:
+    """The log next to a stream with packets of these bytes, by frame number; empty, with a warning, if it is of another
+    run, such as of a stream that was there before this one was joined or copied to its place."""
+    entries = read_log(stream)
+    if any(entry.get("bytes") != sizes[index] for index, entry in entries.items() if index in sizes):
+        _log.warning(
+            "%s is not used: its frames have other sizes than those of %s, so it is of another run",
+            log_path(stream),
+            stream,
+        )
+        return {}
     return entries
 
 

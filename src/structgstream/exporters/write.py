@@ -15,7 +15,7 @@ Gaussians of different frames are not linked, so nothing is predicted from frame
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
@@ -268,7 +268,8 @@ def _save(collected: FramesFile, output: Path) -> None:
         collected.save(partial)
         give_name(partial, output)
     except Exception as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
         if isinstance(error, OSError):
             raise StorageError(f"{output} cannot be written ({error.strerror or error}).") from error
         raise

@@ -89,9 +89,13 @@ class Segment:
         return map(self.record, range(len(self.entries)))
 
 
+class NoSegmentError(StreamError):
+    """The file is a stream, but not a segment of one."""
+
+
 def open_segment(path: Path) -> Segment:
-    """Reads the segment file ``path`` whole; every byte is verified. Raises StreamError if the file is not a segment,
-    or is damaged before its first packet."""
+    """Reads the segment file ``path`` whole; every byte is verified. Raises StreamError if the file is not a segment
+    (NoSegmentError if it is a stream), or is damaged before its first packet."""
     with FileBytes(path) as file:
         data, name = file[:], str(path)
     check_prefix(data, name)
@@ -100,7 +104,7 @@ def open_segment(path: Path) -> Segment:
     if init is None or note is None or init.type != RecordType.INIT:
         raise StreamError(f"{name} is damaged before its first frame: {incomplete_reason(data, PREFIX.size)}.")
     if note.type != NOTE:
-        raise StreamError(f"{name} is a stream, not a segment of one; expected what structgstream fit-group writes.")
+        raise NoSegmentError(f"{name} is a stream, not a segment of one; expected what structgstream fit-group writes.")
     identity = _identity(note, name)
     entries: list[tuple[int, int, int]] = []
     end = note.end
@@ -258,7 +262,7 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
     have been killed just before it did so. A file that is damaged before its first packet is ignored.
 
     Raises:
-        ConfigError: the existing file was fitted from something else.
+        ConfigError: the existing file was fitted from something else, or is a stream.
         StorageError: a file cannot be renamed, or another process writes it.
     """
     if path.exists():
@@ -277,6 +281,10 @@ def _matching(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment
         return None
     try:
         found = open_segment(path)
+    except NoSegmentError:
+        raise ConfigError(
+            f"{path} is a stream, not a segment of one; choose another name, or replace it with --overwrite."
+        ) from None
     except StreamError:
         return None
     if found.identity == identity and found.init == base.init and (identity.first or found.entries):

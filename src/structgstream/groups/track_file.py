@@ -212,7 +212,8 @@ def groups_path(track: Path) -> Path:
 
 def write_groups(track: Path, groups: Groups) -> None:
     """Writes the list of a track atomically. Raises StorageError if it cannot be written."""
-    atomic_write(groups_path(track), "".join(f"{first}:{end}\n" for first, end in groups).encode())
+    lines = "".join(f"{first}:{end}\n" for first, end in groups)
+    atomic_write(groups_path(track), lines.encode(), new_folder=True)
 
 
 def read_groups(track: Path) -> Groups | None:

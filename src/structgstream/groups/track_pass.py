@@ -72,9 +72,15 @@ def track_capture(
     before it did so.
 
     Raises:
-        ConfigError: ``path`` is a track of another header, capture or configuration.
+        ConfigError: ``path`` is a track of another header, capture or configuration, or no frame is after the group
+            ``options.after``.
         StorageError: it cannot be written.
     """
+    if options.after is not None and options.first >= len(source):
+        raise ConfigError(
+            f"{options.after.name} has the frames to before {options.first}, and {len(source)} frames are to be "
+            "tracked, so none is after it; track on from an earlier group, or give more --frames."
+        )
     # With ``quiet``, a group may begin at any key packet; otherwise only at multiples of its length.
     every = min(base.key_interval, options.length) if options.quiet else options.length
     head = TrackHead(

@@ -13,11 +13,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import remove_unused
 from structgstream.cameras import CameraRig
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameSource
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import ConfigError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.groups.base import GroupBase, fingerprint, open_for
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
@@ -222,11 +222,10 @@ def fit_segment(
     track = "" if start is None else hashlib.sha256(start.packed()).hexdigest()
     identity = SegmentIdentity(base.sha256, captured, track, asdict(task.start), task.first, task.end)
     if overwrite:
-        _remove(path)
+        remove_unused(path)
     found = resume_segment(path, base, identity)
     if found is not None and found.complete:
         return None
-    path.parent.mkdir(parents=True, exist_ok=True)
     records = [*found.records()] if found is not None else [] if identity.first else [base.first]
     sink, so_far = SegmentSink(path, base, identity, found), GroupSoFar(base, identity.first, records)
     method = GroupMethod(base.config, task.start, None if start is None else _entry(start, base, source))
@@ -263,11 +262,3 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     displacements[(displacements.abs() <= least).all(1)] = 0.0
     pictures = denoised(source, base.config.denoising)
     return GroupEntry(start.frame, displacements, velocities, lambda: next(pictures.frames(0)))
-
-
-def _remove(path: Path) -> None:
-    try:
-        for name in (path, partial_path(path)):
-            name.unlink(missing_ok=True)
-    except OSError as error:
-        raise StorageError(f"{path} cannot be replaced ({error.strerror}).") from error

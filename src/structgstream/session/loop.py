@@ -384,12 +384,14 @@ def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
             f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
             "Resume with the same preset and options, or start again with --overwrite."
         )
-    ours = _capture_facts(facts.rig, facts.fps, facts.metadata)
-    differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), ours))
+    theirs = _capture_facts(header.rig, header.fps, header.metadata)
+    differing = list(_differences(theirs, _capture_facts(facts.rig, facts.fps, facts.metadata)))
     if differing:
+        plain = [f"{name} {theirs[name]!r}" for name in differing if isinstance(theirs.get(name), str | int | float)]
+        stated = f" (in the stream: {', '.join(plain)})" if plain else ""
         raise ConfigError(
             f"The stream was made from another capture or another part of it: {', '.join(differing[:5])} differ. "
-            "Resume with the same capture and options, or start again with --overwrite."
+            f"Resume with the same capture and options{stated}, or start again with --overwrite."
         )
 
 
