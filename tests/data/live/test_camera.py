@@ -355,6 +355,37 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
     assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("form", "codec", "options"),
+    [("mpjpeg", "mjpeg", {}), ("mjpeg", "mjpeg", {}), ("h264", "libx264", {"tune": "zerolatency"})],
+)
+@pytest.mark.parametrize("base", TimeBase)
+def test_pictures_of_formats_without_stamps_are_taken_when_they_arrive(
+    form: str, codec: str, options: dict[str, str], base: TimeBase
+) -> None:
+    """As web cameras send them, here five a second: what FFmpeg counts for them at 25 a second is no clock."""
+    received, packets, ticks = Received(), Packets(), itertools.count()
+    sent = coded_film(codec, range(60), form=form, **options)
+    feed, faults = camera_feed(
+        received,
+        base=base,
+        recorder=packets,
+        open_camera=lambda *_: closing(av.open(io.BytesIO(sent), format=form)),
+        wait=lambda _: feed.stop(),
+    )
+    feed._now = lambda: next(ticks) * 0.1
+    feed.start()
+    feed.join(WAIT)
+    if base is not TimeBase.ARRIVAL:
+        assert not received.pictures
+        assert faults.counts["a"]["no stamp"] >= 55
+        return
+    assert len(received.pictures) >= 55
+    assert np.ptp([one.seconds - one.arrived for one in received.pictures]) < 0.5
+    recorded = [float(packet.pts * packet.time_base) + shift for packet, shift in packets.found]
+    assert recorded == pytest.approx([one.seconds for one in received.pictures], abs=1e-5)
+
+
 def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:
     """The film over and over, until the end."""
     with av.open(f"rtp://127.0.0.1:{port}", "w", format=form) as output:

@@ -23,6 +23,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -179,6 +180,9 @@ MAX_SOUND_APART_SECONDS = 10.0
 MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
+ARRIVAL_TICK = Fraction(1, 1_000_000)
+NO_TIMESTAMPS = 0x80
+"""FFmpeg's flag of formats without time stamps (AVFMT_NOTIMESTAMPS)."""
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
@@ -302,6 +306,7 @@ class CameraFeed:
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
         self._clock.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
+        stamped = self._camera.is_file or not container.format.flags & NO_TIMESTAMPS
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before, self._held, self._whole = None, [], False
         for packet in container.demux(stream, *self._sound_streams(container)):
@@ -312,10 +317,20 @@ class CameraFeed:
                 continue
             if self._is_duplicate(packet):
                 continue
+            if not stamped:
+                self._stamp_arrival(packet)
             self._hold(packet)
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
                 self._record(frame, shift_seconds=self._picture(frame, wrap))
+
+    def _stamp_arrival(self, packet: "Packet") -> None:
+        """Stamps a packet of a format without stamps by its arrival: FFmpeg counts pictures at 25 a second, or leaves
+        stamps out. Other clocks than ``arrival`` get none; neither do pictures that are not sent in their order."""
+        packet.pts = packet.dts = None
+        if self._clock.base is TimeBase.ARRIVAL and not packet.stream.codec_context.has_b_frames:
+            packet.time_base = ARRIVAL_TICK
+            packet.pts = packet.dts = round((self._now() + self._unix_offset) / ARRIVAL_TICK)
 
     def _hold(self, packet: "Packet") -> None:
         """Holds a packet that may be recorded, after damage from the next key packet on."""

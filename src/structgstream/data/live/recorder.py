@@ -178,7 +178,10 @@ class CameraRecorder:
 
     def record(self, packet: "Packet", *, shift_seconds: float) -> None:
         """Records a packet, whose time on the common clock is its stamp plus ``shift_seconds``."""
-        if self._failed or packet.pts is None or packet.time_base is None:
+        if self._failed:
+            return
+        if packet.pts is None or packet.time_base is None:
+            self._faults.warn(self._name, "recording", "sends packets without time stamps, which are not recorded")
             return
         try:
             with self._lock:
