@@ -336,6 +336,23 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
         assert [*frame.images] == list(NAMES)
 
 
+def test_recorded_pictures_keep_their_times_where_packets_do_not_say_when_they_are_decoded(tmp_path: Path) -> None:
+    """As the first ones of RTSP and Matroska with B-frames, which come before those that are shown before them."""
+    kept = recording.Recording(tmp_path / "take", read_calibration(calibrated(tmp_path / "c")), fps=FPS, masks=tmp_path)
+    recorder = kept.camera("a", FaultLog("rig", now=lambda: 0.0))
+    params = "keyint=12:scenecut=0:b-adapt=0:bframes=3"
+    film = coded_film("libx264", range(24), form="matroska", **{"x264-params": params})
+    with av.open(io.BytesIO(film), "r") as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        assert any(packet.dts is None for packet in packets)
+        for packet in packets:
+            recorder.record(packet, shift_seconds=0.0)
+    kept.close()
+    with av.open(str(tmp_path / "take" / "a.ts")) as container:
+        times = [frame.time for frame in container.decode(video=0)]
+    assert np.diff(times) == pytest.approx(np.full(23, 1 / FPS), abs=2e-3)
+
+
 def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -40,6 +40,9 @@ log = logging.getLogger(__name__)
 
 PART_SECONDS = 12 * 3600.0
 LEAD_SECONDS = 10.0  # for cameras whose first pictures were taken before those of the first packet
+UNKNOWN_REORDERING_SECONDS = 1.0
+"""From decoding to presentation of packets that do not state it, as the first ones of RTSP and Matroska with B-frames:
+less than it is would move pictures to later times."""
 MPEGTS_CODECS = frozenset({"h264", "hevc", "mpeg2video"})
 TICKS = 90_000
 STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
@@ -216,7 +219,7 @@ class CameraRecorder:
         if not same or number < self._part:
             return
         stamp = self._recording.time_in_part(self._part, common)
-        behind = 0.0 if packet.dts is None else pts - float(packet.dts * packet.time_base)
+        behind = UNKNOWN_REORDERING_SECONDS if packet.dts is None else pts - float(packet.dts * packet.time_base)
         self._write(packet, round(stamp * TICKS), round(behind * TICKS))
         line = f"{self._name},{stamp:.6f},{common:.6f},{int(packet.is_keyframe)}\n"
         self._recording.add_line(self._part, STAMPS, line)
