@@ -336,6 +336,20 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
         assert [*frame.images] == list(NAMES)
 
 
+def test_recordings_at_a_time_in_one_folder_replace_nothing_of_each_other(tmp_path: Path) -> None:
+    """The second begins with part 1, and so the first goes on in part 2."""
+    folder, calibration = tmp_path / "take", read_calibration(calibrated(tmp_path / "c"))
+    first = recording.Recording(folder, calibration, fps=FPS, masks=tmp_path)
+    second = recording.Recording(folder, calibration, fps=FPS, masks=tmp_path)
+    second.add_line(0, "frames.jsonl", "second\n")
+    first.part_at(0.0)
+    first.add_line(first.part_at(recording.PART_SECONDS), "frames.jsonl", "first\n")
+    first.close()
+    second.close()
+    assert (folder / "part-001" / "frames.jsonl").read_text() == "second\n"
+    assert (folder / "part-002" / "frames.jsonl").read_text() == "first\n"
+
+
 def test_a_camera_whose_clock_is_far_behind_is_recorded_whole(tmp_path: Path) -> None:
     """The clocks of the rig can be mended afterwards, and what was not stored cannot."""
     folder = tmp_path / "take"

@@ -63,12 +63,12 @@ class Recording:
         self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
         self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.RLock()
-        self._first = _first_part(folder)
+        self._folders: dict[int, Path] = {}
         self._files: dict[int, dict[str, tuple[str, Clock]]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
         made = self.folder(0, {})
-        if self._first:
+        if made != folder:
             log.warning("%s is not empty; the recording goes to %s", folder, made)
 
     def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
@@ -103,14 +103,15 @@ class Recording:
         """The folder of a part, whose ``capture.json`` then names these files of cameras, with their clocks, and those
         before."""
         with self._lock:
-            folder = _part(self._folder, self._first + number)
-            if number not in self._files:
-                self._files[number] = {}
+            if number not in self._folders:
+                # Looked up only now: another recording in the folder may have begun further parts meanwhile.
+                folder = _part(self._folder, _next_part(self._folder))
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                 except OSError as error:
                     raise StorageError(f"The folder {folder} cannot be made ({error.strerror}).") from None
-            known = self._files[number]
+                self._folders[number], self._files[number] = folder, {}
+            folder, known = self._folders[number], self._files[number]
             known.update(files)
             cameras = {}
             for name, camera in self._calibration.cameras.items():
@@ -145,9 +146,7 @@ class Recording:
 
     def add_line(self, number: int, file: str, line: str) -> None:
         """Appends a line to a text file of a part."""
-        if number not in self._files:
-            self.folder(number, {})
-        path = _part(self._folder, self._first + number) / file
+        path = (self._folders.get(number) or self.folder(number, {})) / file
         try:
             with self._lock:
                 text = self._texts.get(path)
@@ -267,8 +266,8 @@ def _part(folder: Path, number: int) -> Path:
     return folder if number == 0 else folder / f"part-{number:03d}"
 
 
-def _first_part(folder: Path) -> int:
-    """The number of the first part of another recording in a folder: nothing is in it, nor in those that follow."""
+def _next_part(folder: Path) -> int:
+    """The number of the next part in a folder: nothing is in it, nor in those that follow."""
     try:
         entries = [entry.name for entry in folder.iterdir()] if folder.exists() else []
     except OSError as error:
