@@ -49,7 +49,9 @@ def test_what_ends_for_good_is_a_file(tmp_path: Path) -> None:
             ("url2", f"file://{tmp_path}/a.ts", ""),
             ("gone", f"file://{tmp_path}/b.ts", ""),
             ("growing", "a.ts", "follow = true"),
+            ("awaited", "c.ts", 'format = "mpegts"\nfollow = true'),
             ("pipe", "pipe", ""),
+            ("pipe2", "pipe", 'format = "mpegts"'),
             ("device", "/dev/null", ""),
             ("driver", "video=Camera", 'format = "dshow"'),
             ("network", "udp://10.0.0.1:5000", ""),
@@ -60,6 +62,8 @@ def test_what_ends_for_good_is_a_file(tmp_path: Path) -> None:
         "path", "format", "missing", "folder", "url", "url2", "gone"
     ]  # fmt: skip
     assert cameras["format"].url == str(tmp_path / "a.ts")
+    assert cameras["awaited"].url == str(tmp_path / "c.ts")
+    assert cameras["pipe2"].url == str(tmp_path / "pipe")
     assert cameras["driver"].url == "video=Camera"
 
 

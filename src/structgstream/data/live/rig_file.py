@@ -124,7 +124,8 @@ def _resolved(rig: LiveRig, path: Path) -> LiveRig:
     cameras = dict(rig.cameras)
     for name, camera in cameras.items():
         file = path.parent / camera.url
-        if not SCHEME.match(camera.url) and (camera.is_session or camera.format is None or file.is_file()):
+        is_path = camera.is_session or camera.format is None or camera.follow or file.exists()
+        if is_path and not SCHEME.match(camera.url):
             cameras[name] = replace(camera, url=str(file))
     return replace(rig, calibration=path.parent / rig.calibration, cameras=cameras)
 
