@@ -20,6 +20,7 @@ import av
 import av.error
 import numpy as np
 import pytest
+from av.codec.context import Flags
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -353,6 +354,36 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
     assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("progressive", None),
+        ("interlaced", "interlaced pictures, whose lines are of two instants"),
+        ("turned", "turned or mirrored to be shown"),
+    ],
+)
+def test_interlaced_and_turned_pictures_are_left_out_as_recordings_refuse_or_turn_them(
+    how: str, said: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    written = io.BytesIO()
+    with av.open(written, "w", format="mp4") as output:
+        params = "tff=1" if how == "interlaced" else ""
+        stream: Any = output.add_stream("libx264", rate=30, options={"x264-params": params})
+        stream.width, stream.height = 128, 96
+        if how == "interlaced":
+            stream.codec_context.flags |= Flags.interlaced_dct | Flags.interlaced_me
+        if how == "turned":
+            stream.set_display_rotation(180)
+        for picture in moving_pictures():
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        output.mux(stream.encode(None))
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(written.getvalue())
+    assert len(received.pictures) == (12 if said is None else 0)
+    assert faults.get("other size", 0) == (0 if said is None else 12)
+    assert said is None or said in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
-from structgstream.data.video_index import load_av, video_stream
+from structgstream.data.video_index import TURNS, display_matrix, load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
 if TYPE_CHECKING:
@@ -470,13 +470,19 @@ class CameraFeed:
         return unix if self._unstamped > MAX_UNSTAMPED else None
 
     def _has_calibrated_shape(self, frame: "VideoFrame") -> bool:
-        """Whether the picture has the proportions of the calibration, at any size."""
+        """Whether the picture has the proportions of the calibration, at any size, and is stored as it is shown."""
         width, height = self._size
-        if (frame.width, frame.height) == (width, height):
-            return True
         alike = abs(frame.width * height - width * frame.height) <= max(width, height)
-        what = "it is resampled" if alike else "it is absent until that is mended, because what is cut off is unknown"
-        text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
+        until = "it is absent until that is mended"
+        if frame.interlaced_frame:
+            alike, text = False, f"sends interlaced pictures, whose lines are of two instants; {until}"
+        elif TURNS.get(display_matrix(frame)) != 0:
+            alike, text = False, f"sends pictures that are turned or mirrored to be shown; {until}"
+        elif (frame.width, frame.height) == (width, height):
+            return True
+        else:
+            what = "it is resampled" if alike else f"{until}, because what is cut off is unknown"
+            text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
         self._faults.report(self.name, Fault.OTHER_SIZE, text)
         if not alike:
             self._synchronizer.mark_absent(self.name)
