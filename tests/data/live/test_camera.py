@@ -417,6 +417,24 @@ def test_pictures_of_formats_without_stamps_are_taken_when_they_arrive(
     assert recorded == pytest.approx([one.seconds for one in received.pictures], abs=1e-5)
 
 
+@pytest.mark.parametrize("stamp", [0.0, 1.7e9])
+def test_stamps_that_are_no_unix_time_are_told(stamp: float, caplog: pytest.LogCaptureFixture) -> None:
+    """As those of most containers, which begin with 0."""
+    feed, _ = camera_feed(Received(), base=TimeBase.UNIX)
+    with caplog.at_level(logging.WARNING):
+        for number in range(3):
+            frame: Any = SimpleNamespace(pts=stamp + number, time_base=1)
+            assert feed._common_time(frame, 1.7e9 - 1000.0 + number, None) == stamp + number
+    assert [record.getMessage() for record in caplog.records] == (
+        []
+        if stamp
+        else [
+            "rig: camera 'a' sends time stamps 1700000000 s from the Unix time of this machine; set the clocks, or take "
+            'clock = "arrival" in the rig file if its stamps are no Unix time'
+        ]
+    )
+
+
 def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:
     """The film over and over, until the end."""
     with av.open(f"rtp://127.0.0.1:{port}", "w", format=form) as output:

@@ -177,6 +177,7 @@ MPEGTS_STAMPS = 2**33
 MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 MAX_SOUND_APART_SECONDS = 10.0
 """Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
+FAR_SECONDS = 60.0  # of Unix time by stamps from that of this machine, before it is reported
 MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
@@ -456,6 +457,12 @@ class CameraFeed:
             self._report_duplicate()
         elif time.fault is Fault.REORDERED:
             self._faults.report(self.name, time.fault, "sends pictures whose time stamps go back; they are left out")
+        elif self._clock.base is TimeBase.UNIX and time.seconds is not None and abs(time.seconds - unix) > FAR_SECONDS:
+            text = (
+                f"sends time stamps {abs(time.seconds - unix):.0f} s from the Unix time of this machine; set the clocks, "
+                'or take clock = "arrival" in the rig file if its stamps are no Unix time'
+            )
+            self._faults.warn(self.name, "unix", text)
         return time.seconds
 
     def _substitute_stamp(self, unix: float) -> float | None:
