@@ -36,7 +36,12 @@ STREAM_FORMATS = frozenset({"mpegts", "mpeg"})
 """FFmpeg's names of containers for transmission, whose time stamps begin anywhere; files of the others begin at 0."""
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
-TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
+TURNS: Mapping[tuple[float, ...], int] = {
+    (1, 0, 0, 1): 0,
+    (0, -1, 1, 0): 1,
+    (-1, 0, 0, -1): 2,
+    (0, 1, -1, 0): 3,
+}
 
 
 # Numbers of ISO/IEC 23091-2.

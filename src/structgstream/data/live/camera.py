@@ -457,10 +457,10 @@ class CameraFeed:
             self._report_duplicate()
         elif time.fault is Fault.REORDERED:
             self._faults.report(self.name, time.fault, "sends pictures whose time stamps go back; they are left out")
-        elif self._clock.base is TimeBase.UNIX and time.seconds is not None and abs(time.seconds - unix) > FAR_SECONDS:
+        elif self._clock.base is TimeBase.UNIX and abs(far := (time.seconds or unix) - unix) > FAR_SECONDS:
             text = (
-                f"sends time stamps {abs(time.seconds - unix):.0f} s from the Unix time of this machine; set the clocks, "
-                'or take clock = "arrival" in the rig file if its stamps are no Unix time'
+                f"sends time stamps {abs(far):.0f} s from the Unix time of this machine; set the clocks, or take "
+                'clock = "arrival" in the rig file if its stamps are no Unix time'
             )
             self._faults.warn(self.name, "unix", text)
         return time.seconds
