@@ -58,13 +58,14 @@ def number_shown(image: NDArray[np.uint8]) -> int:
     return int(errors.argmin())
 
 
-def coded_film(codec: str, numbers: Iterable[int], **options: str) -> bytes:
-    """Pictures of the film of :func:`moving_pictures`, over and over, at the times of their numbers, as MPEG-TS."""
+def coded_film(codec: str, numbers: Iterable[int], *, form: str = "mpegts", **options: str) -> bytes:
+    """Pictures of the film of :func:`moving_pictures`, over and over, at the times of their numbers."""
     written = io.BytesIO()
-    with av.open(written, "w", format="mpegts") as output:
+    with av.open(written, "w", format=form) as output:
         stream = output.add_stream(codec, rate=30, options=options)
         assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        stream.width, stream.height, stream.bit_rate = 128, 96, 2_000_000
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         for number in numbers:
             frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
             frame.pts = number

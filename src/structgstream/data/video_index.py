@@ -36,7 +36,12 @@ STREAM_FORMATS = frozenset({"mpegts", "mpeg"})
 """FFmpeg's names of containers for transmission, whose time stamps begin anywhere; files of the others begin at 0."""
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
-TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
+TURNS: Mapping[tuple[float, ...], int] = {
+    (1, 0, 0, 1): 0,
+    (0, -1, 1, 0): 1,
+    (-1, 0, 0, -1): 2,
+    (0, 1, -1, 0): 3,
+}
 
 
 # Numbers of ISO/IEC 23091-2.
@@ -236,10 +241,7 @@ def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None"
             f"The video {path} is interlaced: its lines are of two instants; set the camera to a progressive mode "
             "(25p, 30p, 50p, 60p), or deinterlace the video to frames first."
         )
-    matrix = None if frame is None else frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
-        return 0
-    a, b, _, c, d, *_ = np.frombuffer(bytes(matrix), "<i4") / 65536
+    a, b, c, d = (1, 0, 0, 1) if frame is None else display_matrix(frame)
     turns = TURNS.get((a, b, c, d))
     if turns is None:
         what = "mirrored" if a * d - b * c < 0 else "turned by an angle that is not a quarter turn"
@@ -247,6 +249,15 @@ def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None"
             f"The metadata of the video {path} say that it is {what}; convert it to one that is stored as it is shown."
         )
     return turns
+
+
+def display_matrix(frame: "VideoFrame") -> tuple[float, float, float, float]:
+    """The upper left of the matrix that turns the stored picture to the shown one, by rows; else the identity."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return 1.0, 0.0, 0.0, 1.0
+    a, b, _, c, d, *_ = np.frombuffer(bytes(matrix), "<i4") / 65536
+    return float(a), float(b), float(c), float(d)
 
 
 def transfer_of(frame: "VideoFrame") -> int:

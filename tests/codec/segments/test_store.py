@@ -49,9 +49,12 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
 
 def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / ".new-manifest.json").write_bytes(b"half")
-    (tmp_path / ".new").write_bytes(b"not ours")
+    (tmp_path / ".new-structgstream-owner.json").write_bytes(b"half")
+    others = [".new", ".new-notes.txt"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"not ours")
     FolderStore(tmp_path).prepare()
-    assert os.listdir(tmp_path) == [".new"]
+    assert sorted(os.listdir(tmp_path)) == others
 
 
 def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ import av
 import av.error
 import numpy as np
 import pytest
+from av.codec.context import Flags
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -353,6 +354,80 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
     assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("progressive", None),
+        ("interlaced", "interlaced pictures, whose lines are of two instants"),
+        ("turned", "turned or mirrored to be shown"),
+    ],
+)
+def test_interlaced_and_turned_pictures_are_left_out_as_recordings_refuse_or_turn_them(
+    how: str, said: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    written = io.BytesIO()
+    with av.open(written, "w", format="mp4") as output:
+        params = "tff=1" if how == "interlaced" else ""
+        stream: Any = output.add_stream("libx264", rate=30, options={"x264-params": params})
+        stream.width, stream.height = 128, 96
+        if how == "interlaced":
+            stream.codec_context.flags |= Flags.interlaced_dct | Flags.interlaced_me
+        if how == "turned":
+            stream.set_display_rotation(180)
+        for picture in moving_pictures():
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        output.mux(stream.encode(None))
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(written.getvalue())
+    assert len(received.pictures) == (12 if said is None else 0)
+    assert faults.get("other size", 0) == (0 if said is None else 12)
+    assert said is None or said in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("form", "codec", "options"),
+    [("mpjpeg", "mjpeg", {}), ("mjpeg", "mjpeg", {}), ("h264", "libx264", {"tune": "zerolatency"})],
+)
+@pytest.mark.parametrize("base", TimeBase)
+def test_pictures_of_formats_without_stamps_are_taken_when_they_arrive(
+    form: str, codec: str, options: dict[str, str], base: TimeBase
+) -> None:
+    """As web cameras send them, here five a second: what FFmpeg counts for them at 25 a second is no clock."""
+    received, packets, ticks = Received(), Packets(), itertools.count()
+    sent = coded_film(codec, range(60), form=form, **options)
+    feed, faults = camera_feed(
+        received,
+        base=base,
+        recorder=packets,
+        open_camera=lambda *_: closing(av.open(io.BytesIO(sent), format=form)),
+        wait=lambda _: feed.stop(),
+    )
+    feed._now = lambda: next(ticks) * 0.1
+    feed.start()
+    feed.join(WAIT)
+    if base is not TimeBase.ARRIVAL:
+        assert not received.pictures
+        assert faults.counts["a"]["no stamp"] >= 55
+        return
+    assert len(received.pictures) >= 55
+    assert np.ptp([one.seconds - one.arrived for one in received.pictures]) < 0.5
+    recorded = [float(packet.pts * packet.time_base) + shift for packet, shift in packets.found]
+    assert recorded == pytest.approx([one.seconds for one in received.pictures], abs=1e-5)
+
+
+@pytest.mark.parametrize("stamp", [1000.0, 1.7e9])
+def test_stamps_that_are_no_unix_time_are_told(stamp: float, caplog: pytest.LogCaptureFixture) -> None:
+    """As those of most containers, which begin with 0."""
+    feed, _ = camera_feed(Received(), base=TimeBase.UNIX)
+    with caplog.at_level(logging.WARNING):
+        for number in range(3):
+            frame: Any = SimpleNamespace(pts=stamp + number, time_base=1)
+            assert feed._common_time(frame, 1.7e9 - 1000.0 + number, None) == stamp + number
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == (0 if stamp == 1.7e9 else 1)
+    assert all("sends time stamps 1699999000 s from the Unix time of this machine; set the" in text for text in said)
 
 
 def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:

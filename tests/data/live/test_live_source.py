@@ -336,6 +336,56 @@ def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tm
         assert [*frame.images] == list(NAMES)
 
 
+def test_recordings_at_a_time_in_one_folder_replace_nothing_of_each_other(tmp_path: Path) -> None:
+    """The second begins with part 1, and so the first goes on in part 2."""
+    folder, calibration = tmp_path / "take", read_calibration(calibrated(tmp_path / "c"))
+    first = recording.Recording(folder, calibration, fps=FPS, masks=tmp_path)
+    second = recording.Recording(folder, calibration, fps=FPS, masks=tmp_path)
+    second.add_line(0, "frames.jsonl", "second\n")
+    first.part_at(0.0)
+    first.add_line(first.part_at(recording.PART_SECONDS), "frames.jsonl", "first\n")
+    first.close()
+    second.close()
+    assert (folder / "part-001" / "frames.jsonl").read_text() == "second\n"
+    assert (folder / "part-002" / "frames.jsonl").read_text() == "first\n"
+
+
+def test_a_camera_whose_clock_is_far_behind_is_recorded_whole(tmp_path: Path) -> None:
+    """The clocks of the rig can be mended afterwards, and what was not stored cannot."""
+    folder = tmp_path / "take"
+    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS, masks=tmp_path)
+    for name, shift in (("a", 5000.0), ("b", 5000.0), ("c", 100.0)):
+        recorder = kept.camera(name, FaultLog("rig", now=lambda: 0.0))
+        with av.open(io.BytesIO(coded_film("libx264", range(24), g="6", bf="0")), "r") as container:
+            for packet in container.demux(video=0):
+                if packet.size:
+                    recorder.record(packet, shift_seconds=shift)
+    kept.close()
+    with pytest.raises(CaptureError, match=r"'c' ends with the instant -4889.* share one clock"):
+        open_capture(folder)
+    text = (folder / "capture.json").read_text()
+    (folder / "capture.json").write_text(text.replace('"offset_seconds": -4900.0', '"offset_seconds": 0.0'))
+    frames = list(open_capture(folder).frames())
+    assert [sorted(frame.images) for frame in frames] == [list(NAMES)] * 24
+
+
+def test_recorded_pictures_keep_their_times_where_packets_do_not_say_when_they_are_decoded(tmp_path: Path) -> None:
+    """As the first ones of RTSP and Matroska with B-frames, which come before those that are shown before them."""
+    kept = recording.Recording(tmp_path / "take", read_calibration(calibrated(tmp_path / "c")), fps=FPS, masks=tmp_path)
+    recorder = kept.camera("a", FaultLog("rig", now=lambda: 0.0))
+    params = "keyint=12:scenecut=0:b-adapt=0:bframes=3"
+    film = coded_film("libx264", range(24), form="matroska", **{"x264-params": params})
+    with av.open(io.BytesIO(film), "r") as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        assert any(packet.dts is None for packet in packets)
+        for packet in packets:
+            recorder.record(packet, shift_seconds=0.0)
+    kept.close()
+    with av.open(str(tmp_path / "take" / "a.ts")) as container:
+        times = [frame.time for frame in container.decode(video=0)]
+    assert np.diff(times) == pytest.approx(np.full(23, 1 / FPS), abs=2e-3)
+
+
 def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -112,6 +112,16 @@ def test_frame_0_and_the_last_frames_are_kept_and_no_more(tmp_path: Path) -> Non
     assert list(again.frames(20)) == []
 
 
+def test_frames_of_a_stream_of_months_are_found_and_removed(tmp_path: Path) -> None:
+    """Their numbers have more digits than names are filled up to."""
+    frames = cache(tmp_path / "x.live")
+    for index in range(10**8 - 3, 10**8 + 6):
+        frames.store(frame(index), origin_seconds=100.0)
+    assert len(list((tmp_path / "x.live").glob("frame-*"))) <= 1 + LAST
+    again = cache(tmp_path / "x.live", resume=True).last()
+    assert again == ((10**8 + 5) / 4, 100.0)
+
+
 @pytest.mark.parametrize(
     ("firsts", "last", "kept"), [((11,), 4, [11, *range(14, 20)]), ((4, 6), 0, [4, 6, 17, 18, 19])]
 )

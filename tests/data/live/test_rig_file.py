@@ -18,9 +18,9 @@ end_seconds = 60
 without = ["c"]
 
 [cameras.a]
-url = "rtsp://user:secret@10.0.0.11/stream"
+url = "http://user:secret@10.0.0.11/stream"
 offset_seconds = -0.04
-options = {rtsp_transport = "tcp"}
+options = {reconnect = "1"}
 
 [cameras.b]
 url = "take/b.ts"
@@ -49,7 +49,9 @@ def test_what_ends_for_good_is_a_file(tmp_path: Path) -> None:
             ("url2", f"file://{tmp_path}/a.ts", ""),
             ("gone", f"file://{tmp_path}/b.ts", ""),
             ("growing", "a.ts", "follow = true"),
+            ("awaited", "c.ts", 'format = "mpegts"\nfollow = true'),
             ("pipe", "pipe", ""),
+            ("pipe2", "pipe", 'format = "mpegts"'),
             ("device", "/dev/null", ""),
             ("driver", "video=Camera", 'format = "dshow"'),
             ("network", "udp://10.0.0.1:5000", ""),
@@ -60,6 +62,8 @@ def test_what_ends_for_good_is_a_file(tmp_path: Path) -> None:
         "path", "format", "missing", "folder", "url", "url2", "gone"
     ]  # fmt: skip
     assert cameras["format"].url == str(tmp_path / "a.ts")
+    assert cameras["awaited"].url == str(tmp_path / "c.ts")
+    assert cameras["pipe2"].url == str(tmp_path / "pipe")
     assert cameras["driver"].url == "video=Camera"
 
 
@@ -69,12 +73,13 @@ def test_everything_that_a_file_can_say(tmp_path: Path) -> None:
     assert (rig.tolerance_seconds, rig.end_seconds, rig.without) == (0.01, 60.0, ("c",))
     assert rig.calibration == tmp_path / "capture"
     a, b = rig.cameras.values()
-    assert (a.offset_seconds, a.options, a.is_file) == (-0.04, {"rtsp_transport": "tcp"}, False)
+    assert (a.offset_seconds, a.options, a.is_file) == (-0.04, {"reconnect": "1"}, False)
     assert (b.url, b.follow, b.is_file) == (str(tmp_path / "take/b.ts"), True, False)
 
 
 def test_a_description_of_a_session_is_beside_the_rig_file_and_no_recording(tmp_path: Path) -> None:
-    rig = read_rig(written(tmp_path, WHOLE.replace("take/b.ts", "b.sdp").replace("follow = true", 'format = "sdp"')))
+    text = WHOLE.replace("take/b.ts", "b.sdp").replace("follow = true", 'format = "sdp"')
+    rig = read_rig(written(tmp_path, text.replace('clock = "stream"', 'clock = "arrival"')))
     camera = rig.cameras["b"]
     assert (camera.url, camera.is_session, camera.is_file) == (str(tmp_path / "b.sdp"), True, False)
     assert not LiveCamera("b.sdp").is_file
@@ -101,11 +106,13 @@ def test_little_is_needed(tmp_path: Path) -> None:
         ("fps = 25", 'fps = "25"', "fps = '25'"),
         ("fps = 25", "fps = nan", "fps = nan"),
         ('clock = "stream"', 'clock = "ntp"', "arrival, stream or unix"),
+        ("http://user", "rtsp://user", 'clock = "stream", and camera \'a\' sends RTP.*take clock = "arrival"'),
+        ("take/b.ts", "b.sdp", "camera 'b' sends RTP"),
         ("queue_frames = 16", "queue_frames = 1", "from 2 to 10000"),
         ("offset_seconds = -0.04", "offset = 1", "no key 'offset' in camera 'a'"),
         ('url = "take/b.ts"', "", "'url' is missing in camera 'b'"),
         ("follow = true", 'follow = "yes"', "true or false"),
-        ('options = {rtsp_transport = "tcp"}', "options = {timeout = 5}", "a table of texts"),
+        ('options = {reconnect = "1"}', "options = {timeout = 5}", "a table of texts"),
         ("[cameras.a]", "[camera.a]", "no key 'camera'"),
         ("[cameras.b]", "[cameras.a]", "cannot be read"),
         ("[cameras.b]", '[cameras.d]\nurl = "take/b.ts"\nfollow = true\n[cameras.b]', "'d' and 'b' of .* have one url"),

@@ -14,6 +14,7 @@ from structgstream.atomic_files import lock_file, open_lockable, replacing
 from structgstream.codec.container.byte_source import free_bytes
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.errors import StorageError, StreamError
+from structgstream.owned_folders import MARKER
 from structgstream.remote_folders import open_url, reason_of, shown_address
 
 MAX_FILE_BYTES = 2**32
@@ -99,7 +100,9 @@ class FolderStore:
         self.make()
         try:
             for path in self.folder.glob(f"{_TEMPORARY}*"):
-                path.unlink(missing_ok=True)
+                name = path.name.removeprefix(_TEMPORARY)
+                if is_ours(name) or name == MARKER:
+                    path.unlink(missing_ok=True)
         except OSError as error:
             raise StorageError(f"{self.folder} cannot be changed ({error.strerror}).") from error
 

@@ -23,6 +23,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -32,7 +33,7 @@ from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
-from structgstream.data.video_index import load_av, video_stream
+from structgstream.data.video_index import TURNS, display_matrix, load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
 if TYPE_CHECKING:
@@ -176,9 +177,13 @@ MPEGTS_STAMPS = 2**33
 MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 MAX_SOUND_APART_SECONDS = 10.0
 """Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
+FAR_SECONDS = 60.0  # of Unix time by stamps from that of this machine, before it is reported
 MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
+ARRIVAL_TICK = Fraction(1, 1_000_000)
+NO_TIMESTAMPS = 0x80
+"""FFmpeg's flag of formats without time stamps (AVFMT_NOTIMESTAMPS)."""
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
@@ -302,6 +307,7 @@ class CameraFeed:
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
         self._clock.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
+        stamped = self._camera.is_file or not container.format.flags & NO_TIMESTAMPS
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before, self._held, self._whole = None, [], False
         for packet in container.demux(stream, *self._sound_streams(container)):
@@ -312,10 +318,20 @@ class CameraFeed:
                 continue
             if self._is_duplicate(packet):
                 continue
+            if not stamped:
+                self._stamp_arrival(packet)
             self._hold(packet)
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
                 self._record(frame, shift_seconds=self._picture(frame, wrap))
+
+    def _stamp_arrival(self, packet: "Packet") -> None:
+        """Stamps a packet of a format without stamps by its arrival: FFmpeg counts pictures at 25 a second, or leaves
+        stamps out. Other clocks than ``arrival`` get none; neither do pictures that are not sent in their order."""
+        packet.pts = packet.dts = None
+        if self._clock.base is TimeBase.ARRIVAL and not packet.stream.codec_context.has_b_frames:
+            packet.time_base = ARRIVAL_TICK
+            packet.pts = packet.dts = round((self._now() + self._unix_offset) / ARRIVAL_TICK)
 
     def _hold(self, packet: "Packet") -> None:
         """Holds a packet that may be recorded, after damage from the next key packet on."""
@@ -441,6 +457,12 @@ class CameraFeed:
             self._report_duplicate()
         elif time.fault is Fault.REORDERED:
             self._faults.report(self.name, time.fault, "sends pictures whose time stamps go back; they are left out")
+        elif self._clock.base is TimeBase.UNIX and abs(far := (time.seconds or unix) - unix) > FAR_SECONDS:
+            text = (
+                f"sends time stamps {abs(far):.0f} s from the Unix time of this machine; set the clocks, or take "
+                'clock = "arrival" in the rig file if its stamps are no Unix time'
+            )
+            self._faults.warn(self.name, "unix", text)
         return time.seconds
 
     def _substitute_stamp(self, unix: float) -> float | None:
@@ -455,13 +477,19 @@ class CameraFeed:
         return unix if self._unstamped > MAX_UNSTAMPED else None
 
     def _has_calibrated_shape(self, frame: "VideoFrame") -> bool:
-        """Whether the picture has the proportions of the calibration, at any size."""
+        """Whether the picture has the proportions of the calibration, at any size, and is stored as it is shown."""
         width, height = self._size
-        if (frame.width, frame.height) == (width, height):
-            return True
         alike = abs(frame.width * height - width * frame.height) <= max(width, height)
-        what = "it is resampled" if alike else "it is absent until that is mended, because what is cut off is unknown"
-        text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
+        until = "it is absent until that is mended"
+        if frame.interlaced_frame:
+            alike, text = False, f"sends interlaced pictures, whose lines are of two instants; {until}"
+        elif TURNS.get(display_matrix(frame)) != 0:
+            alike, text = False, f"sends pictures that are turned or mirrored to be shown; {until}"
+        elif (frame.width, frame.height) == (width, height):
+            return True
+        else:
+            what = "it is resampled" if alike else f"{until}, because what is cut off is unknown"
+            text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
         self._faults.report(self.name, Fault.OTHER_SIZE, text)
         if not alike:
             self._synchronizer.mark_absent(self.name)

@@ -3,7 +3,8 @@
 
 Each camera has a file: MPEG-TS for codecs that it supports, Matroska for others; both can be read up to where a crash
 truncated them. Time stamps are those of the common clock, less its value at the start, so that a camera that
-reconnected or whose clock was reset stays synchronised; pictures are not encoded again. ``capture.json`` makes the
+reconnected or whose clock was reset stays synchronised (later by a constant, which ``capture.json`` states, if they
+would be negative); pictures are not encoded again. ``capture.json`` makes the
 folder a prepared capture of the cameras that sent something. Damaged packets, those after them up to the next key
 packet, and pictures of other proportions are not recorded.
 
@@ -40,6 +41,9 @@ log = logging.getLogger(__name__)
 
 PART_SECONDS = 12 * 3600.0
 LEAD_SECONDS = 10.0  # for cameras whose first pictures were taken before those of the first packet
+UNKNOWN_REORDERING_SECONDS = 1.0
+"""From decoding to presentation of packets that do not state it, as the first ones of RTSP and Matroska with B-frames:
+less than it is would move pictures to later times."""
 MPEGTS_CODECS = frozenset({"h264", "hevc", "mpeg2video"})
 TICKS = 90_000
 STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
@@ -59,12 +63,12 @@ class Recording:
         self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
         self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.RLock()
-        self._first = _first_part(folder)
-        self._files: dict[int, dict[str, str]] = {}
+        self._folders: dict[int, Path] = {}
+        self._files: dict[int, dict[str, tuple[str, Clock]]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
         made = self.folder(0, {})
-        if self._first:
+        if made != folder:
             log.warning("%s is not empty; the recording goes to %s", folder, made)
 
     def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
@@ -93,24 +97,26 @@ class Recording:
             if number == part == len(self._starts) - 1:
                 self._starts.append(common_seconds)
                 return number + 1
-            return number if number > part and common_seconds >= self._starts[number] else None
+            return number if number > part else None
 
-    def folder(self, number: int, files: Mapping[str, str]) -> Path:
-        """The folder of a part, whose ``capture.json`` then names these files of cameras, and those before."""
+    def folder(self, number: int, files: Mapping[str, tuple[str, Clock]]) -> Path:
+        """The folder of a part, whose ``capture.json`` then names these files of cameras, with their clocks, and those
+        before."""
         with self._lock:
-            folder = _part(self._folder, self._first + number)
-            if number not in self._files:
-                self._files[number] = {}
+            if number not in self._folders:
+                # Looked up only now: another recording in the folder may have begun further parts meanwhile.
+                folder = _part(self._folder, _next_part(self._folder))
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                 except OSError as error:
                     raise StorageError(f"The folder {folder} cannot be made ({error.strerror}).") from None
-            known = self._files[number]
+                self._folders[number], self._files[number] = folder, {}
+            folder, known = self._folders[number], self._files[number]
             known.update(files)
-            cameras = {
-                name: replace(camera, files=known.get(name, f"{name}.ts"), clock=Clock())
-                for name, camera in self._calibration.cameras.items()
-            }
+            cameras = {}
+            for name, camera in self._calibration.cameras.items():
+                file, clock = known.get(name, (f"{name}.ts", Clock()))
+                cameras[name] = replace(camera, files=file, clock=clock)
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
             write_prepared(folder, capture.only(known) if known else capture)
             for name in files:
@@ -140,9 +146,7 @@ class Recording:
 
     def add_line(self, number: int, file: str, line: str) -> None:
         """Appends a line to a text file of a part."""
-        if number not in self._files:
-            self.folder(number, {})
-        path = _part(self._folder, self._first + number) / file
+        path = (self._folders.get(number) or self.folder(number, {})) / file
         try:
             with self._lock:
                 text = self._texts.get(path)
@@ -173,12 +177,16 @@ class CameraRecorder:
         self._codec: tuple[object, ...] | None = None
         self._part = -1
         self._last = -1
+        self._later = 0.0  # how much later than on the common clock its file has its pictures, seconds
         self._failed = False
         self._lock = threading.Lock()
 
     def record(self, packet: "Packet", *, shift_seconds: float) -> None:
         """Records a packet, whose time on the common clock is its stamp plus ``shift_seconds``."""
-        if self._failed or packet.pts is None or packet.time_base is None:
+        if self._failed:
+            return
+        if packet.pts is None or packet.time_base is None:
+            self._faults.warn(self._name, "recording", "sends packets without time stamps, which are not recorded")
             return
         try:
             with self._lock:
@@ -208,12 +216,12 @@ class CameraRecorder:
         same = self._output is not None and _codec(packet.stream) == self._codec
         starts = packet.is_keyframe and (number > self._part or not same)
         if starts and (new := self._recording.next_part(self._part, common)) is not None:
-            self._open(packet, new)
+            self._open(packet, new, common)
             number, same = new, True
         if not same or number < self._part:
             return
-        stamp = self._recording.time_in_part(self._part, common)
-        behind = 0.0 if packet.dts is None else pts - float(packet.dts * packet.time_base)
+        stamp = self._recording.time_in_part(self._part, common) + self._later
+        behind = UNKNOWN_REORDERING_SECONDS if packet.dts is None else pts - float(packet.dts * packet.time_base)
         self._write(packet, round(stamp * TICKS), round(behind * TICKS))
         line = f"{self._name},{stamp:.6f},{common:.6f},{int(packet.is_keyframe)}\n"
         self._recording.add_line(self._part, STAMPS, line)
@@ -229,12 +237,15 @@ class CameraRecorder:
         self._last = copy.dts
         self._output.mux(copy)
 
-    def _open(self, packet: "Packet", number: int) -> None:
+    def _open(self, packet: "Packet", number: int, common_seconds: float) -> None:
         self._close()
+        begin = self._recording.time_in_part(number, common_seconds)
+        # Its clock is far behind that of the first camera: a file has no times before 0.
+        self._later = 0.0 if begin >= 0 else LEAD_SECONDS - begin
         codec = packet.stream.codec_context.name
         suffix, kind = ("ts", "mpegts") if codec in MPEGTS_CODECS else ("mkv", "matroska")
         name = f"{self._name}.{suffix}"
-        folder = self._recording.folder(number, {self._name: name})
+        folder = self._recording.folder(number, {self._name: (name, Clock(0.0 - self._later))})
         self._output = load_av().open(str(folder / name), "w", format=kind, options={"flush_packets": "1"})
         self._stream = self._output.add_stream_from_template(packet.stream)
         self._codec, self._part, self._last = _codec(packet.stream), number, -1
@@ -255,8 +266,8 @@ def _part(folder: Path, number: int) -> Path:
     return folder if number == 0 else folder / f"part-{number:03d}"
 
 
-def _first_part(folder: Path) -> int:
-    """The number of the first part of another recording in a folder: nothing is in it, nor in those that follow."""
+def _next_part(folder: Path) -> int:
+    """The number of the next part in a folder: nothing is in it, nor in those that follow."""
     try:
         entries = [entry.name for entry in folder.iterdir()] if folder.exists() else []
     except OSError as error:

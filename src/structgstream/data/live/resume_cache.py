@@ -35,7 +35,7 @@ from structgstream.owned_folders import check_owned, own_folder
 LAST = 3
 """Frames besides the period's first: the one being fitted, the one before it, and one that may have been prefetched."""
 FOLDER_PURPOSE = "pictures that a live stream needs to be resumed"
-FILE_NAME = re.compile(r"frame-(\d{8})\.pictures")
+FILE_NAME = re.compile(r"frame-(\d{8,})\.pictures")
 FORMAT = "structgstream-pictures-2"
 LEVEL = 1  # 300 MB/s and more, at about the sizes of higher levels: noise does not compress
 MAX_HEADER = 1 << 20

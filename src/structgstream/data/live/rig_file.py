@@ -19,6 +19,7 @@ from structgstream.remote_folders import shown_address, without_secrets
 Parsed = TypeVar("Parsed")
 FILE_URL = re.compile(r"^file:(//(?=/))?", re.IGNORECASE)
 SCHEME = re.compile(r"^[a-z][a-z0-9+.-]+:", re.IGNORECASE)
+RTSP = re.compile(r"^rtsps?:", re.IGNORECASE)
 
 
 class TimeBase(StrEnum):
@@ -100,6 +101,13 @@ def read_rig(path: Path) -> LiveRig:
             raise CaptureError(f"Cameras {other!r} and {name!r} of {path} have one url; give each its own.")
     settings = {"name": path.stem, **content, "cameras": cameras}
     rig = _parse(LiveRig, settings, where=f"the rig file {path}")
+    own = [name for name, camera in cameras.items() if camera.is_session or RTSP.match(camera.url)]
+    if own and rig.clock is not TimeBase.ARRIVAL:
+        raise CaptureError(
+            f'{path} has clock = "{rig.clock}", and camera {own[0]!r} sends RTP, whose stamps begin anew with each '
+            'connection, so they are of no common clock; take clock = "arrival", and offset_seconds where cameras have '
+            "other delays."
+        )
     return _resolved(rig, path)
 
 
@@ -124,7 +132,8 @@ def _resolved(rig: LiveRig, path: Path) -> LiveRig:
     cameras = dict(rig.cameras)
     for name, camera in cameras.items():
         file = path.parent / camera.url
-        if not SCHEME.match(camera.url) and (camera.is_session or camera.format is None or file.is_file()):
+        is_path = camera.is_session or camera.format is None or camera.follow or file.exists()
+        if is_path and not SCHEME.match(camera.url):
             cameras[name] = replace(camera, url=str(file))
     return replace(rig, calibration=path.parent / rig.calibration, cameras=cameras)
 

@@ -21,7 +21,7 @@ class Fault(StrEnum):
 
     GONE = "gone"  # it cannot be opened, has ended, or sends nothing
     GARBAGE = "garbage"  # what it sent cannot be decoded; absent until the next key frame
-    OTHER_SIZE = "other size"  # its picture does not have the size of the calibration
+    OTHER_SIZE = "other size"  # its picture is not of the calibration's size, or is interlaced, turned or mirrored
     STUCK = "stuck"  # the same picture while others change
     JUMP = "jump"  # its clock was reset
     DUPLICATE = "duplicate"  # the time stamp of an earlier picture
