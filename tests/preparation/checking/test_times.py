@@ -105,6 +105,15 @@ def test_a_camera_in_which_nothing_changes_is_named() -> None:
     assert "Nothing changes in the pictures of camera 'cam1', but in those of most others" in finding.sentence
 
 
+def test_a_camera_of_another_moment_is_no_silence() -> None:
+    """Three seconds late, in a take of less than two: it agrees with nobody."""
+    check = check_synchronization(MadeSource(RIG, {"cam1": 3.0}))
+    assert check.undecided == ("cam1",)
+    (finding,) = time_findings(check)
+    assert (finding.severity, finding.cameras) == ("note", ("cam1",))
+    assert "cannot be determined whether camera 'cam1' is in step with the others" in finding.sentence
+
+
 def test_the_bundled_clip_is_synchronous() -> None:
     check = check_synchronization(bundled_clip())
     assert check.conclusive

@@ -43,7 +43,7 @@ Judgement = Literal["bumped", "stood", "unknown"]
 class Movement:
     """How what is seen in a picture moved."""
 
-    pixels: float  # median shift; 0 for a picture that stayed
+    pixels: float  # median shift; 0 for a picture that stayed, infinite for one that is gone
     homography: Floats  # ``[3, 3]``, from pixels of the first picture to pixels of the other
 
     @property

@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource, apart_seconds
 from structgstream.errors import import_extra
@@ -125,7 +126,7 @@ def _stated_lateness(source: FrameSource) -> dict[str, float]:
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
     """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on,
-    a note if none can be judged.
+    a note of those that cannot be judged.
 
     Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
     between those of the others get one warning.
@@ -144,6 +145,13 @@ def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
             "It cannot be determined whether the cameras are synchronous: too little moves that several of them see."
         )
         return [*findings, Finding("note", unknown)]
+    if apart := tuple(name for name in measured.undecided if name not in measured.still):
+        sentence = (
+            f"It cannot be determined whether {listed(apart)} {'are' if len(apart) > 1 else 'is'} in step with the "
+            "others: too little moves that they see together, or clocks are seconds apart; compare their pictures of "
+            "one frame."
+        )
+        findings.append(Finding("note", sentence, apart))
     for name, late in measured.late_seconds.items():
         if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):
             continue
