@@ -90,7 +90,7 @@ def test_a_camera_that_was_covered_is_named() -> None:
     """Where the scene of the others stayed; a cut to another scene in all is no camera's."""
     before, after = filmed(room(), 0), filmed(room(), 10)
     (found,) = findings(before, {**after, "cam02": np.zeros_like(after["cam02"])})
-    assert (found.severity, found.cameras) == ("error", ("cam02",))
+    assert (found.severity, found.cameras) == ("warning", ("cam02",))
     assert (
         "Camera 'cam02' shows in frame 9 hardly anything of what it shows in frame 0: it was covered" in found.sentence
     )

@@ -97,7 +97,7 @@ def bump_findings(
             f"Camera {name!r} shows in frame {last.index} hardly anything of what it shows in frame {first.index}: it "
             "was covered, turned away or out of focus, or its signal was lost; use the frames before, or leave it out."
         )
-        findings.append(Finding("error", sentence, (name,)))
+        findings.append(Finding("warning", sentence, (name,)))
     if not moved:
         return findings
     later = gather(last, {name: cameras[name] for name in names})

@@ -92,8 +92,9 @@ def exposure_findings(first: MultiViewFrame, last: MultiViewFrame) -> list[Findi
     """
     cv2 = opencv()
     ratios = {}
-    for name in first.images.keys() & last.images.keys():
-        one, other = (cv2.blur(frame.images[name][..., 1], (PATCH, PATCH)).astype(float) for frame in (first, last))
+    for name in (name for name in first.images if name in last.images):
+        smooth = (cv2.blur(frame.images[name][..., 1], (PATCH, PATCH)) for frame in (first, last))
+        one, other = (green[::PATCH, ::PATCH].astype(np.float64) for green in smooth)
         valid = (np.minimum(one, other) > DARK) & (np.maximum(one, other) < BRIGHT)
         if valid.any():
             ratios[name] = np.log2(_linear(other[valid]) / _linear(one[valid]))
@@ -108,10 +109,10 @@ def exposure_findings(first: MultiViewFrame, last: MultiViewFrame) -> list[Findi
         return []
     sentence = (
         f"Exposure changes between frame {first.index} and frame {last.index}, in stops against the other cameras: "
-        f"{_worst(changed)}; a stream has one gain for all frames of a camera, so brightness will pump: lock exposure "
-        "and gain before the take."
+        f"{_worst(changed)}; a stream has one gain for all frames of a camera, so brightness will change with it: lock "
+        "exposure and gain before the take."
     )
-    return [Finding("warning", sentence, tuple(sorted(changed)))]
+    return [Finding("warning", sentence, tuple(changed))]
 
 
 def _worst(stops: Mapping[str, float], limit: int = 6) -> str:
