@@ -76,10 +76,10 @@ def test_the_worst_of_many_are_reported_first() -> None:
 
 def test_exposure_that_changes_during_the_take_is_named() -> None:
     """Not light that changes for all, nor what moves: other patches are lighter and darker by other amounts."""
-    before = MultiViewFrame(0, 0.0, evidence_of(dict.fromkeys("abcd", (0.0,) * 3)).images)
+    before = MultiViewFrame(0, 0.0, evidence_of(dict.fromkeys("abcd", (0.0, 0.0, 0.0))).images)
 
     def found(stops: dict[str, float], *, wrong: float = 0.0) -> list[Finding]:
-        gains = {name: (stops.get(name, 0.0),) * 3 for name in "abcd"}
+        gains = {name: (own, own, own) for name in "abcd" for own in [stops.get(name, 0.0)]}
         return exposure_findings(before, MultiViewFrame(9, 0.3, evidence_of(gains, wrong=wrong).images))
 
     (finding,) = found({"c": -0.7})
