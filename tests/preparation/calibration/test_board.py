@@ -98,6 +98,20 @@ def test_corners_are_seen_where_they_are() -> None:
         assert np.median(np.linalg.norm(apart, axis=1)) < 0.15
 
 
+def test_a_board_of_older_tools_with_an_even_number_of_rows() -> None:
+    """It begins with a marker; its corners are where those of the other one are."""
+    board = Board(9, 6, 0.09)
+    whole = board_plane(board, pose_of(2))
+    height, width = whole.texture.shape[:2]
+    print_ = board.opencv_board(marker_first=True).generateImage((width, height), marginSize=20)
+    pictures = [Film(RIG["cam00"]).picture([replace(whole, texture=print_)], noise=1)]
+    (sight,) = board_sightings({"cam00": pictures * 4}, board)["cam00"][:1]
+    (other,) = board_sightings({"cam00": [Film(RIG["cam00"]).picture([whole], noise=1)] * 4}, board)["cam00"][:1]
+    shared, here, there = np.intersect1d(sight.corners, other.corners, return_indices=True)
+    assert len(shared) > 0.6 * len(board.corners)
+    np.testing.assert_allclose(sight.pixels[here], other.pixels[there], atol=0.5)
+
+
 def test_a_row_of_corners_is_no_sighting() -> None:
     """Corners on a line say nothing of the board's tilt: of one picture only the two upper rows of squares are left."""
     whole = board_plane(BOARD, pose_of(2), pixels_a_square=40)

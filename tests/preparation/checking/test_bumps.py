@@ -13,7 +13,7 @@ from structgstream.cameras import Camera
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import gather
-from structgstream.preparation.checking.bumps import bump_findings, picture_movement
+from structgstream.preparation.checking.bumps import GONE, bump_findings, picture_movement
 from tests.support.filmed import Film, Plane, noise_texture, ring, room, turned
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -86,6 +86,17 @@ def test_bumped_cameras_of_a_room_are_named_and_no_others() -> None:
     assert "shifted by 9.8 pixels" in found.sentence
 
 
+def test_a_camera_that_was_covered_is_named() -> None:
+    """Where the scene of the others stayed; a cut to another scene in all is no camera's."""
+    before, after = filmed(room(), 0), filmed(room(), 10)
+    (found,) = findings(before, {**after, "cam02": np.zeros_like(after["cam02"])})
+    assert (found.severity, found.cameras) == ("warning", ("cam02",))
+    assert (
+        "Camera 'cam02' shows in frame 9 hardly anything of what it shows in frame 0: it was covered" in found.sentence
+    )
+    assert findings(before, filmed(room(1), 10)) == []
+
+
 def test_a_bumped_camera_is_named_before_a_moving_thing() -> None:
     before, after = moving_sheet()
     found = findings(before, after | {"cam02": np.roll(after["cam02"], (9, 0), axis=(0, 1))})
@@ -144,6 +155,7 @@ def test_things_that_move_in_several_ways_are_no_motion_of_the_camera() -> None:
     assert picture_movement(view(), np.concatenate(bands, axis=1)) is None
 
 
-def test_pictures_of_other_things_and_bare_ones_tell_nothing() -> None:
-    assert picture_movement(view(), noise_texture(9, size=SIZE)) is None
-    assert picture_movement(view(), np.full_like(view(), 90)) is None
+def test_pictures_of_other_things_are_no_motion_and_bare_ones_tell_nothing() -> None:
+    assert picture_movement(view(), noise_texture(9, size=SIZE)) is GONE
+    assert picture_movement(view(), np.full_like(view(), 90)) is GONE
+    assert picture_movement(np.full_like(view(), 90), view()) is None

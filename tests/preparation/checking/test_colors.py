@@ -6,8 +6,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from structgstream.frames import MultiViewFrame
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import Evidence
-from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
+from structgstream.preparation.checking.colors import Color, color_findings, compare_colors, exposure_findings
 
 SIDE, ACROSS = 9, 12
 PATCHES = ACROSS * ACROSS
@@ -70,6 +72,23 @@ def test_the_worst_of_many_are_reported_first() -> None:
     assert "'cam7' +1.20, 'cam6' +1.10" in found.sentence
     assert "and 2 more" in found.sentence
     assert len(found.cameras) == 8
+
+
+def test_exposure_that_changes_during_the_take_is_named() -> None:
+    """Not light that changes for all, nor what moves: other patches are lighter and darker by other amounts."""
+    before = MultiViewFrame(0, 0.0, evidence_of(dict.fromkeys("abcd", (0.0, 0.0, 0.0))).images)
+
+    def found(stops: dict[str, float], *, wrong: float = 0.0) -> list[Finding]:
+        gains = {name: (own, own, own) for name in "abcd" for own in [stops.get(name, 0.0)]}
+        return exposure_findings(before, MultiViewFrame(9, 0.3, evidence_of(gains, wrong=wrong).images))
+
+    (finding,) = found({"c": -0.7})
+    assert (finding.severity, finding.cameras) == ("warning", ("c",))
+    assert "between frame 0 and frame 9, in stops against the other cameras: 'c' -0.7" in finding.sentence
+    assert [finding.cameras for finding in found({"b": 0.5}, wrong=0.3)] == [("b",)]
+    assert found(dict.fromkeys("abcd", -0.7)) == []
+    moved = {**before.images, "c": before.images["c"][::-1]}
+    assert exposure_findings(before, MultiViewFrame(9, 0.3, moved)) == []
 
 
 def test_without_matches_nothing_is_compared() -> None:

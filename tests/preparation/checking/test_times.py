@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether pictures of one frame are of one moment, and what is said of it."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from structgstream.cameras import CameraRig
 from structgstream.data.dataset_layouts import bundled_clip
+from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.times import SynchronizationCheck, check_synchronization, time_findings
 from tests.support.takes import MadeSource, ring
 
@@ -89,6 +91,27 @@ def test_without_motion_it_cannot_be_reported() -> None:
     (finding,) = time_findings(check)
     assert finding.severity == "note"
     assert "cannot be determined" in finding.sentence
+
+
+def test_a_camera_in_which_nothing_changes_is_named() -> None:
+    class Frozen(MadeSource):
+        def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+            first = next(super().frames())
+            for frame in super().frames(start):
+                yield replace(frame, images={**frame.images, "cam1": first.images["cam1"]})
+
+    (finding,) = time_findings(check_synchronization(Frozen(RIG, {})))
+    assert (finding.severity, finding.cameras) == ("warning", ("cam1",))
+    assert "Nothing changes in the pictures of camera 'cam1', but in those of most others" in finding.sentence
+
+
+def test_a_camera_of_another_moment_is_no_silence() -> None:
+    """Three seconds late, in a take of less than two: it agrees with nobody."""
+    check = check_synchronization(MadeSource(RIG, {"cam1": 3.0}))
+    assert check.undecided == ("cam1",)
+    (finding,) = time_findings(check)
+    assert (finding.severity, finding.cameras) == ("note", ("cam1",))
+    assert "cannot be determined whether camera 'cam1' is in step with the others" in finding.sentence
 
 
 def test_the_bundled_clip_is_synchronous() -> None:

@@ -109,6 +109,21 @@ def test_a_clap_that_agrees_with_another_clap_is_refused() -> None:
     assert audio_lags({**one, **other}) == []
 
 
+@pytest.mark.parametrize("at", [[], [2.2]])
+def test_cameras_that_beep_when_they_start_and_stop_did_not_start_at_once(at: list[float]) -> None:
+    """What each hears of itself agrees at no lag at all, be there a clap that all hear or nothing."""
+    beep = 0.5 * np.sin(2 * np.pi * 2000 / 48000 * np.arange(6000))
+    sounds = {}
+    for name, sound in claps(STARTS, PLACES[: len(at)], at=at).items():
+        samples = sound.samples.copy()
+        for second in (0.1, 0.3, 4.7):
+            samples[round(second * 48000) :][: len(beep)] += beep
+        sounds[name] = sound_of(name, samples)
+    for lag in audio_lags(sounds):
+        apart = STARTS[lag.first].offset_seconds - STARTS[lag.second].offset_seconds
+        assert lag.at(0.0) == pytest.approx(apart, abs=0.01)
+
+
 def test_a_room_that_is_louder_than_the_direct_sound_is_uncertain() -> None:
     """Echoes make peaks that all windows agree on; how high others are tells."""
     scores = []

@@ -67,8 +67,9 @@ class Board:
             f"markers {1000 * self.square_metres * self.marker_share:g} mm, {self.dictionary}"
         )
 
-    def opencv_board(self) -> Any:
-        """The board as OpenCV's."""
+    def opencv_board(self, *, marker_first: bool = False) -> Any:
+        """The board as OpenCV's; with ``marker_first`` as OpenCV before 4.6 and calib.io print it, where an even number
+        of rows begins with a marker in place of a black square. Corners are the same."""
         aruco = opencv().aruco
         number = getattr(aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
@@ -83,7 +84,9 @@ class Board:
                 f"{available}; take a larger dictionary or fewer squares."
             )
         side = self.square_metres
-        return aruco.CharucoBoard((self.columns, self.rows), side, side * self.marker_share, markers)
+        board = aruco.CharucoBoard((self.columns, self.rows), side, side * self.marker_share, markers)
+        board.setLegacyPattern(marker_first)
+        return board
 
 
 def dictionaries() -> list[str]:
@@ -156,8 +159,15 @@ def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[Indices, NDArray
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # of markers; chessboard corners always are
-    detector = cv2.aruco.CharucoDetector(board.opencv_board(), cv2.aruco.CharucoParameters(), parameters)
-    pixels, corners, _, ids = detector.detectBoard(grey)
+    pixels: Any = None
+    corners: Any = None
+    ids: Any = None
+    for marker_first in (False, True)[: 2 - board.rows % 2]:
+        layout = board.opencv_board(marker_first=marker_first)
+        detector = cv2.aruco.CharucoDetector(layout, cv2.aruco.CharucoParameters(), parameters)
+        pixels, corners, _, ids = detector.detectBoard(grey)
+        if ids is None or (corners is not None and len(corners)):
+            break
     read = set() if ids is None else {int(number) for number in np.ravel(ids)}
     if corners is None or len(corners) == 0:
         return np.empty(0, np.intp), np.empty((0, 2)), read

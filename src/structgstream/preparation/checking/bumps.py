@@ -33,6 +33,7 @@ STILL_PIXELS = 1.0  # times pixel_scale
 STILL_SHARE = 0.2
 MOVED_SHARE = 0.5
 MIN_MATCHES = 30
+MANY_KEYPOINTS = 4 * MIN_MATCHES  # of a picture whose like must show some of them again
 CLEAR = 0.5  # largest ratio of the errors of two explanations at which a match speaks for the better one
 MIN_VOTES = 15
 Judgement = Literal["bumped", "stood", "unknown"]
@@ -42,7 +43,7 @@ Judgement = Literal["bumped", "stood", "unknown"]
 class Movement:
     """How what is seen in a picture moved."""
 
-    pixels: float  # median shift; 0 for a picture that stayed
+    pixels: float  # median shift; 0 for a picture that stayed, infinite for one that is gone
     homography: Floats  # ``[3, 3]``, from pixels of the first picture to pixels of the other
 
     @property
@@ -52,6 +53,7 @@ class Movement:
 
 
 STAYED = Movement(0.0, np.eye(3))
+GONE = Movement(np.inf, np.eye(3))  # hardly anything of the first picture is in the other
 
 
 def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Movement | None:
@@ -61,11 +63,9 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
     exactly that). A flat thing that moves in front of a plain background does that too.
     """
     before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
-    if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
-        return None
     rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T
     if len(rows) < MIN_MATCHES:
-        return None
+        return GONE if len(before.pixels) >= MANY_KEYPOINTS else None
     start, end = before.pixels[rows], after.pixels[columns]
     still = STILL_PIXELS * pixel_scale(one.shape[1])
     distances = np.linalg.norm(end - start, axis=1)
@@ -82,17 +82,25 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
 def bump_findings(
     first: MultiViewFrame, last: MultiViewFrame, evidence: Evidence, cameras: Mapping[str, Camera]
 ) -> list[Finding]:
-    """Cameras that were bumped between two frames, and once those for which that cannot be measured; ``first`` is the
-    frame of ``evidence``."""
+    """Cameras that were bumped between two frames or then show something else, and once those for which that cannot be
+    measured; ``first`` is the frame of ``evidence``."""
     names = [name for name in cameras if name in first.images and name in last.images]
     movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}
     moved = {name: movement for name, movement in movements.items() if movement is not None and not movement.stayed}
-    if not moved:
-        return []
-    later = gather(last, {name: cameras[name] for name in names})
     stayed = sum(movement is not None and movement.stayed for movement in movements.values())
     background = stayed > len(moved)  # most cameras see what stands still, so the others would see it too
+    gone = [name for name, movement in moved.items() if movement is GONE]
+    moved = {name: movement for name, movement in moved.items() if movement is not GONE}
     findings, unknown = [], []
+    for name in gone if background else ():
+        sentence = (
+            f"Camera {name!r} shows in frame {last.index} hardly anything of what it shows in frame {first.index}: it "
+            "was covered, turned away or out of focus, or its signal was lost; use the frames before, or leave it out."
+        )
+        findings.append(Finding("warning", sentence, (name,)))
+    if not moved:
+        return findings
+    later = gather(last, {name: cameras[name] for name in names})
     for name, movement in moved.items():
         judged = _judged(name, movement, (evidence, later), cameras)
         if judged == "bumped" or (judged == "unknown" and background):

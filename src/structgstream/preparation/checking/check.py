@@ -15,7 +15,7 @@ from structgstream.pose_check.check import Finding, examine_poses, explain, wors
 from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
-from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
+from structgstream.preparation.checking.colors import Color, color_findings, compare_colors, exposure_findings
 from structgstream.preparation.checking.overlap import (
     Coverage,
     coverage,
@@ -191,6 +191,7 @@ def check_capture(
         last = next(source.frames(end))
         note(last, presence)
         findings += bump_findings(first.frame, last, first.evidence, first.cameras)
+        findings += exposure_findings(first.frame, last)
     findings += presence_findings(presence, source.fps, passed=passed_frames(source))
     listener.progress(2, 3, "times")
     times = _measured_times(source, first.suspects)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure and white balance of cameras relative to each other, from matched pixels."""
+"""Exposure and white balance of cameras relative to each other, from matched pixels, and exposure that changes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.images import opencv
+from structgstream.frames import MultiViewFrame
 from structgstream.geometry import Floats, Indices
 from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import Evidence
@@ -17,6 +18,7 @@ DARK, BRIGHT = 12.0, 243.0
 ROUNDS = 20
 MIN_MATCHES = 15
 EXPOSURE_STOPS, BALANCE_STOPS = 0.33, 0.2
+ALIKE, ALIKE_SHARE = 1 / 3, 0.5  # of a change, by which pixels differ from it; of pixels that do not differ more
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,36 @@ def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
         )
         findings.append(Finding("warning", sentence, tuple(balance)))
     return findings
+
+
+def exposure_findings(first: MultiViewFrame, last: MultiViewFrame) -> list[Finding]:
+    """A warning of cameras whose exposure changed between two frames; light that changes for most is no camera's.
+
+    What moves changes some pixels by different amounts, exposure most pixels by one.
+    """
+    cv2 = opencv()
+    ratios = {}
+    for name in (name for name in first.images if name in last.images):
+        smooth = (cv2.blur(frame.images[name][..., 1], (PATCH, PATCH)) for frame in (first, last))
+        one, other = (green[::PATCH, ::PATCH].astype(np.float64) for green in smooth)
+        valid = (np.minimum(one, other) > DARK) & (np.maximum(one, other) < BRIGHT)
+        if valid.any():
+            ratios[name] = np.log2(_linear(other[valid]) / _linear(one[valid]))
+    common = float(np.median([np.median(own) for own in ratios.values()])) if ratios else 0.0
+    changed = {}
+    for name, own in ratios.items():
+        stops = float(np.median(own)) - common
+        alike = float(np.mean(np.abs(own - common - stops) < ALIKE * abs(stops)))
+        if abs(stops) > EXPOSURE_STOPS and alike > ALIKE_SHARE:
+            changed[name] = stops
+    if not changed:
+        return []
+    sentence = (
+        f"Exposure changes between frame {first.index} and frame {last.index}, in stops against the other cameras: "
+        f"{_worst(changed)}; a stream has one gain for all frames of a camera, so brightness will change with it: lock "
+        "exposure and gain before the take."
+    )
+    return [Finding("warning", sentence, tuple(changed))]
 
 
 def _worst(stops: Mapping[str, float], limit: int = 6) -> str:

@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource, apart_seconds
 from structgstream.errors import import_extra
@@ -50,6 +51,8 @@ class SynchronizationCheck:
     apart_seconds: Mapping[str, float] = field(default_factory=dict)
     """Camera to how long after their instants its pictures were taken by their time stamps, relative to most cameras;
     empty where the capture has no time stamps."""
+    still: tuple[str, ...] = ()
+    """Cameras in whose pictures nothing changes, where it does in those of most; of ``undecided``."""
 
     @property
     def between(self) -> dict[str, float]:
@@ -82,8 +85,10 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     takes = {name: (float(own.times[0]), float(own.times[-1])) for name, own in changes.items() if len(own.times)}
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=period / 2) if pairs else ((), None, [])
     lateness = _stated_lateness(source)
+    still = tuple(name for name, own in changes.items() if len(own.times) > 1 and not own.moving)
+    still = still if 2 * len(still) < len(changes) else ()
     if coarse is None:
-        return SynchronizationCheck({}, {}, (), tuple(source.rig), period, lateness)
+        return SynchronizationCheck({}, {}, (), tuple(source.rig), period, lateness, still)
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
     # A clock that is uncertain by a good part of a frame is not judged, however far it is from the others.
@@ -92,7 +97,7 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     errors = {name: solution.sigmas[name] for name in judged}
     off = tuple(name for name in judged if abs(late[name]) > max(OFF_PERIODS * period, SIGMAS * errors[name]))
     undecided = tuple(name for name in source.rig if name not in judged)
-    return SynchronizationCheck(late, errors, off, undecided, period, lateness)
+    return SynchronizationCheck(late, errors, off, undecided, period, lateness, still)
 
 
 def _changes(source: FrameSource) -> dict[str, Changes]:
@@ -121,7 +126,7 @@ def _stated_lateness(source: FrameSource) -> dict[str, float]:
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
     """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on,
-    a note if none can be judged.
+    a note of those that cannot be judged.
 
     Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
     between those of the others get one warning.
@@ -129,11 +134,24 @@ def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
     if measured is None:
         return []
     findings = [_between(measured)] if measured.between else []
+    for name in measured.still:
+        sentence = (
+            f"Nothing changes in the pictures of camera {name!r}, but in those of most others: it froze, or it sees "
+            "nothing of what moves. Look at its video; if it froze, leave the camera out."
+        )
+        findings.append(Finding("warning", sentence, (name,)))
     if not measured.conclusive:
         unknown = (
             "It cannot be determined whether the cameras are synchronous: too little moves that several of them see."
         )
         return [*findings, Finding("note", unknown)]
+    if apart := tuple(name for name in measured.undecided if name not in measured.still):
+        sentence = (
+            f"It cannot be determined whether {listed(apart)} {'are' if len(apart) > 1 else 'is'} in step with the "
+            "others: too little moves that they see together, or clocks are seconds apart; compare their pictures of "
+            "one frame."
+        )
+        findings.append(Finding("note", sentence, apart))
     for name, late in measured.late_seconds.items():
         if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):
             continue

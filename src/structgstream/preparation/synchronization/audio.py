@@ -118,6 +118,8 @@ LOOP_WEIGHT = 1 / 3  # that a closed loop leaves: its lags, if wrong, would be s
 MAX_LOOPS = 3
 SPEED_OF_SOUND = 343.0  # metres a second, at 20 degrees Celsius
 STEP_SECONDS = 0.004  # of onsets
+OWN_SECONDS, OWN_SHARE = 0.5, 0.1
+"""At both ends of a take, at most this share of it: there cameras hear themselves beep that they start or stop."""
 SMOOTHING_STEPS = 1.0  # standard deviation; ways of sound that differ by a metre are apart by less than a step
 BANDS_HERTZ = (LOW_HERTZ, 600.0, 1500.0, 3500.0, HIGH_HERTZ)
 MIN_OVERLAP_SECONDS = 1.0
@@ -344,7 +346,8 @@ def _on_a_line(found: list[Window]) -> list[Window]:
 
 
 def _onsets(samples: Samples) -> Signal:
-    """Smoothed increases ``[T, B]`` of the logarithm of the energy in each band, above the band's usual energy."""
+    """Smoothed increases ``[T, B]`` of the logarithm of the energy in each band, above the band's usual energy; none at
+    the ends of the take, where the sounds of cameras themselves would say that all started at once."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import butter, sosfilt
 
@@ -358,6 +361,8 @@ def _onsets(samples: Samples) -> Signal:
         level = np.log(energy + max(float(np.median(energy)), 1e-12 * float(energy.max()), 1e-30))
         channels.append(np.maximum(np.diff(level, prepend=level[0]), 0.0))
     onsets = gaussian_filter1d(np.stack(channels, axis=1), SMOOTHING_STEPS, axis=0)
+    own = round(min(OWN_SECONDS, OWN_SHARE * count * STEP_SECONDS) / STEP_SECONDS)
+    onsets[:own] = onsets[count - own :] = 0.0
     return Signal(onsets, STEP_SECONDS / 2, STEP_SECONDS)
 
 
