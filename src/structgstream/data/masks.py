@@ -111,7 +111,8 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
 
 def masks_folder(path: Path) -> Path:
     """Where the masks of the capture or the videos in ``path`` lie, however the folder is capitalised."""
-    found = (entry for entry in sorted(path.iterdir()) if entry.is_dir() and entry.name.lower() == FOLDER)
+    entries = sorted(path.iterdir()) if path.is_dir() else []
+    found = (entry for entry in entries if entry.is_dir() and entry.name.lower() == FOLDER)
     return next(found, path / FOLDER)
 
 

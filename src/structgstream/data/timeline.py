@@ -95,7 +95,7 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
 
 
 def _unpadded(number: str) -> str:
-    return number if "." in number else str(int(number))
+    return number.rstrip("0") if "." in number else str(int(number))
 
 
 def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
