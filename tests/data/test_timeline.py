@@ -36,7 +36,10 @@ def test_times_in_names_sort_by_value_whatever_their_number_of_decimals() -> Non
     """``str(time.time())`` leaves out the last zeros."""
     times = ["1700000000.05", "1700000000.1", "1700000000.1333", "1700000000.16", "1700000000.2"]
     assert sorted(times, key=natural) == times
-    assert slots(a=" ".join(times), b=" ".join(["1700000000.10", *times[2:]])) == {"a": [0, 1, 2, 3, 4], "b": [1, 2, 3, 4]}
+    assert slots(a=" ".join(times), b=" ".join(["1700000000.10", *times[2:]])) == {
+        "a": [0, 1, 2, 3, 4],
+        "b": [1, 2, 3, 4],
+    }
 
 
 def test_a_late_start_and_an_early_end_cut_the_range_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
