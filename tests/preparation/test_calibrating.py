@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from structgstream.data.calibration import Calibration, PosedCamera
+from structgstream.data.calibration import Calibration, PosedCamera, rigid
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError, CaptureError, ConfigError
 from structgstream.preparation.calibration.board import Board
@@ -134,8 +134,10 @@ def test_a_calibration_of_turned_pictures_is_refused_for_stored_ones(
     exif = Image.Exif()
     exif[0x112] = 3
     cameras = tuple(
-        PosedCamera(name, np.eye(4), np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]]), (8, 6), Pinhole())
-        for name in "abc"
+        PosedCamera(
+            name, rigid(np.eye(3), [x, 0, 0]), np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]]), (8, 6), Pinhole()
+        )
+        for x, name in enumerate("abc")
     )
     for camera in cameras:
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / f"{camera.name}.jpg", exif=exif)

@@ -146,5 +146,5 @@ class KilledStore:
         if not killed or self.done:
             do()
         if killed:
-            (self.store.folder / ".new-torn").write_bytes(b"half of it")
+            (self.store.folder / ".new-manifest.json").write_bytes(b"half of it")
             raise Killed
