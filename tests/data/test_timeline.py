@@ -30,6 +30,8 @@ def common(**slots: list[int]) -> range:
 
 def test_numbers_sort_by_value() -> None:
     assert sorted(["cam10", "cam2", "a", "30", "4"], key=natural) == ["4", "30", "a", "cam2", "cam10"]
+    numbered = ["20220101120000.2", "20220101120000.10"]
+    assert sorted(numbered, key=natural) == numbered, "frames after a date"
 
 
 def test_times_in_names_sort_by_value_whatever_their_number_of_decimals() -> None:

@@ -56,8 +56,9 @@ class Clock:
         return self.offset_seconds + self.rate * stamps
 
 
-NUMBER = re.compile(r"(\d{10,}\.\d+|\d+)")
-"""A number in a name: whole, or a time since 1970 with its decimals, of which ``str`` leaves out the last zeros."""
+NUMBER = re.compile(r"((?<!\d)1\d{9}\.\d+|\d+)")
+"""A number in a name: whole, or seconds since 1970 with decimals, of which ``str`` leaves out the last zeros. A frame's
+number may follow a date (``20220101120000.2``), which has other digits."""
 
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
