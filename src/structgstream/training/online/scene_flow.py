@@ -123,7 +123,8 @@ FAST_SHARE = 1 / 80
 
 COUNTS = ("displaced", "corrected", "fast", "fast displaced")
 """Primitives displaced by flow between pictures; by flow from the rendering; those whose flow between pictures is
-larger than :data:`FAST_SHARE`; and of these the displaced ones, as the others are likely to leave ghosts."""
+larger than :data:`FAST_SHARE`; and of these the ones displaced in either round, as the others are likely to leave
+ghosts."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,7 @@ def apply_scene_flow(
         )
         displacements, corrected = displacements + second.displacements, second.lifted
         moved = split.displaced(displacements)
-    counts = torch.stack([first.lifted, corrected, first.fast, first.fast & first.lifted]).sum(1).tolist()
+    counts = torch.stack([first.lifted, corrected, first.fast, first.fast & (first.lifted | corrected)]).sum(1).tolist()
     return SceneFlow(moved, displacements, active_tiles, dict(zip(COUNTS, counts, strict=True)))
 
 
