@@ -16,7 +16,7 @@ import pytest
 
 from structgstream.data.calibration import rigid, rotation_matrix
 from structgstream.data.lenses import Fisheye, RadialTangential, from_integer_centers
-from structgstream.data.open import open_capture, read_calibrated
+from structgstream.data.open import open_capture, read_calibration
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import (
     NAMES,
@@ -187,9 +187,9 @@ def test_the_lens_model_is_what_a_file_calls_it(
         with pytest.raises(
             CalibrationError, match=r"'cam00' of .*\(the lens model omnidirectional, which is not known"
         ):
-            read_calibrated(tmp_path)
+            read_calibration(tmp_path)
         return
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert {camera.lens for camera in found.cameras} == {lens(0.1, 0.02, 0.003, 0.001)}
 
@@ -199,7 +199,7 @@ def test_lists_of_words_are_no_matrices(tmp_path: Path, content: str) -> None:
     """Nine names look like a matrix of nine numbers."""
     (tmp_path / "take.yaml").write_text(content)
     calibrated(tmp_path)
-    assert read_calibrated(tmp_path) is not None
+    assert read_calibration(tmp_path) is not None
 
 
 def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_poses_without_intrinsics_are_no_projection_matrices(tmp_path: Path) -> 
     with pytest.raises(
         CalibrationError, match=r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
     ):
-        read_calibrated(tmp_path)
+        read_calibration(tmp_path)
 
 
 @pytest.mark.parametrize("place", ["optimized/cameras", "meta/calib"])
@@ -328,7 +328,7 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
     if form == "list.yaml":
         cameras = [{"name": name, **entry} for name, entry in entries.items()]
         (tmp_path / "rig.yaml").write_text(json.dumps({"cameras": cameras}))
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     for truth, camera in zip(truths(), found.cameras, strict=True):
         assert (camera.name, camera.size) == (truth.name, (WIDTH, HEIGHT))
@@ -369,14 +369,14 @@ def test_calibrations_that_differ_are_refused(tmp_path: Path) -> None:
     turn = rotation_matrix(np.array([0.4, -1.2, 2.0]))
     elsewhere = [replace(own, R=own.R @ turn.T, T=2.5 * own.T - own.R @ turn.T @ [3.0, -1.0, 0.5]) for own in cameras]
     write_anipose(tmp_path, elsewhere).rename(tmp_path / "copy.toml")  # in another world and unit
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert found.where.name == "copy.toml"
     moved = [*cameras[:2], Truth("cam02", cameras[2].K, cameras[2].dist, cameras[2].R, cameras[2].T + 0.5)]
     write_anipose(tmp_path, moved).rename(tmp_path / "tuesday.toml")
     with pytest.raises(CalibrationError, match=r"several calibrations that differ, copy\.toml and tuesday\.toml"):
-        read_calibrated(tmp_path)
-    assert read_calibrated(tmp_path, tmp_path / "tuesday.toml") is not None
+        read_calibration(tmp_path)
+    assert read_calibration(tmp_path, tmp_path / "tuesday.toml") is not None
 
 
 def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -392,10 +392,10 @@ def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFix
 def test_files_of_windows_editors(tool: str, tmp_path: Path) -> None:
     """A byte order mark and carriage returns change nothing."""
     WRITERS[tool](tmp_path, truths())
-    plain = read_calibrated(tmp_path)
+    plain = read_calibration(tmp_path)
     for file in tmp_path.iterdir():
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
-    marked = read_calibrated(tmp_path)
+    marked = read_calibration(tmp_path)
     assert plain is not None
     assert marked is not None
     for one, other in zip(plain.cameras, marked.cameras, strict=True):
@@ -405,10 +405,10 @@ def test_files_of_windows_editors(tool: str, tmp_path: Path) -> None:
 
 def test_kalibr_with_an_imu(tmp_path: Path) -> None:
     file = write_kalibr(tmp_path, truths())
-    plain = read_calibrated(tmp_path)
+    plain = read_calibration(tmp_path)
     file.write_text(f"%YAML:1.0\n---\n{file.read_text()}\nT_imu_body:\n  [1.0, 0.0, 0.0]\n")
     (tmp_path / "a_imu_chain.yaml").write_text("imu0:\n  update_rate: 200.0\n")
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert plain is not None
     assert found is not None
     assert [camera.name for camera in found.cameras] == ["cam0", "cam1", "cam2"]
@@ -425,7 +425,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
         own += "camera_group: 0\n" + opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
         text += f"camera_{number}:\n" + "".join(f"  {line}\n" for line in own.splitlines())
     (tmp_path / "calibrated_cameras_data.yml").write_text(text)
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert [camera.name for camera in found.cameras] == ["camera_0", "camera_1", "camera_2"]
     for truth, camera in zip(truths(), found.cameras, strict=True):
@@ -433,7 +433,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
     file = tmp_path / "calibrated_cameras_data.yml"
     file.write_text(file.read_text().replace("camera_group: 0", "camera_group: 1", 1))
     with pytest.raises(CalibrationError, match=r"data\.yml has 2 groups of cameras .*each with a world of its own"):
-        read_calibrated(tmp_path)
+        read_calibration(tmp_path)
 
 
 @pytest.mark.parametrize("written", ["", '"null"'])

@@ -111,32 +111,27 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
     """Cameras of one file, and those pictures of each that exist, by the name of the instant."""
     with readable(meta, "w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras"):
         content = mapping(read_json(meta))
-        width, height = pixels((content["w"], content["h"]))
+        size = pixels((content["w"], content["h"]))
         pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
-        rows = [
-            # The path below ``ims`` may name that and what is above it.
-            (
-                str(name),
-                K,
-                viewmat,
-                pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:])),
-                file,
-            )
-            for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
-            for name, K, viewmat, file in zip(*frame, strict=True)
-        ]
+        rows = []
+        for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True):
+            for name, K, viewmat, file in zip(*frame, strict=True):
+                # The path below ``ims`` may name that and what is above it.
+                picture = pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:]))
+                rows.append((str(name), (K, viewmat), file, picture))
     first: dict[str, tuple[Any, Any]] = {}
-    files: dict[str, dict[str, Path]] = {name: {} for name, *_ in rows}
-    for name, K, viewmat, picture, file in rows:
-        known = first.setdefault(name, (K, viewmat))
-        if known != (K, viewmat) and not _same(known, (K, viewmat)):
+    files: dict[str, dict[str, Path]] = {}
+    for name, matrices, file, picture in rows:
+        known = first.setdefault(name, matrices)
+        if known != matrices and not _same(known, matrices):
             raise CalibrationError(
                 f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
             )
+        own = files.setdefault(name, {})
         if picture is not None:
-            files[name][picture.stem] = picture
+            own[picture.stem] = picture
     cameras = {
-        name: calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=meta)
+        name: calibrated_camera(name, viewmat=viewmat, K=K, size=size, where=meta)
         for name, (K, viewmat) in first.items()
     }
     return cameras, files
@@ -306,9 +301,9 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
 
 
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
-    width, height = pixels((content["width"], content["height"]))
+    size = pixels((content["width"], content["height"]))
     cameras = {
-        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], size=size, where=file)
         for name, entry in mapping(content["cameras"]).items()
     }
     near = positive(content, "near") if "near" in content else None
@@ -318,13 +313,13 @@ def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
 
 def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
     K = [[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]]
-    width, height = pixels((content["w"], content["h"]))
+    size = pixels((content["w"], content["h"]))
     cameras: dict[str, Camera] = {}
     for index, pose in enumerate(content["cams"]):
         name = f"cam{index:02d}"
         with readable(f"Camera {name!r} of {file}", "a pose of 4x4 numbers that can be inverted"):
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
-        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
+        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, size=size, where=file)
     return calibrated_rig(cameras, ("cam00",), where=file)
 
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.data.timeline import common_slots, instants_of, natural
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError, import_extra
 from structgstream.frames import MultiViewFrame
@@ -80,17 +80,23 @@ class ImageSource:
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
-                found = pool.map(
-                    _picture,
-                    paths.values(),
-                    [self.rig[name] for name in paths],
-                    repeat(bits),
-                    [self.turns.get(name, 1) for name in paths],
-                )
-                pictures = dict(zip(paths, found, strict=True))
+                pictures = dict(zip(paths, pool.map(self._read, paths, paths.values(), repeat(bits)), strict=True))
                 masks = {name: mask for name, (_, mask) in pictures.items() if mask is not None}
                 images = {name: picture for name, (picture, _) in pictures.items()}
                 yield MultiViewFrame(index, index / self.fps, images, masks=masks)
+
+    def _read(self, name: str, path: Path, bits: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """A picture of a camera and where it is opaque, turned, checked against the size of the camera."""
+        picture, mask = read_picture_and_mask(path, bits=bits)
+        turn, camera = self.turns.get(name, 1), self.rig[name]
+        picture, mask = turned(picture, turn), None if mask is None else turned(mask, turn)
+        height, width = picture.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise CalibrationError(
+                f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
+                f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
+            )
+        return picture, mask
 
 
 def opencv() -> ModuleType:
@@ -223,13 +229,18 @@ def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
     return bits
 
 
-def _may_be_deep(path: Path) -> bool:
-    """Whether a file may hold more than 8 bits, by its header."""
+def read_bytes(path: Path, *, what: str = "picture", count: int = -1) -> bytes:
+    """The content of a file, or its first ``count`` bytes. Raises CaptureError, which names ``what`` it is."""
     try:
         with path.open("rb") as file:
-            head = file.read(25)
+            return file.read(count)
     except OSError as error:
-        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+        raise CaptureError(f"The {what} {path} cannot be read ({error.strerror}); restore it.") from None
+
+
+def _may_be_deep(path: Path) -> bool:
+    """Whether a file may hold more than 8 bits, by its header."""
+    head = read_bytes(path, count=25)
     if head[:8] == b"\x89PNG\r\n\x1a\n":
         return head[24:25] == b"\x10"
     return head[:2] in (b"II", b"MM", b"P5", b"P6", b"\xff\x4f") or head[4:8] == b"jP  "
@@ -237,11 +248,7 @@ def _may_be_deep(path: Path) -> bool:
 
 def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """The values of a file, ``[H, W]``, or ``[H, W, 3 or 4]`` in OpenCV's order of colours."""
-    cv2 = opencv()
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+    cv2, data = opencv(), read_bytes(path)
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
         return _heif_picture(path, data)
     if not data or is_cut_jpeg(data):
@@ -342,19 +349,6 @@ def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
     except Exception:  # a damaged one can raise anything
         raise _undecodable(path, data) from None
     return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
-
-
-def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """One picture and where it is opaque, checked against the size of its camera."""
-    picture, mask = read_picture_and_mask(path, bits=bits)
-    picture, mask = turned(picture, turn), None if mask is None else turned(mask, turn)
-    height, width = picture.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise CalibrationError(
-            f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
-            f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
-        )
-    return picture, mask
 
 
 def turned(picture: NDArray[Pixel], orientation: int) -> NDArray[Pixel]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
 from structgstream.data.camera_files import by_stem, is_hidden, name_of
-from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, read_bytes, reduced_mask
 from structgstream.data.source import FrameSource, SourceWrapper, innermost, resized_to
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import UndistortedSource, lenses_of
@@ -91,11 +91,7 @@ class MaskedSource(SourceWrapper):
 
 def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is neither black nor transparent."""
-    cv2 = opencv()
-    try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError as error:
-        raise CaptureError(f"The mask {file} cannot be read ({error.strerror}); restore it.") from None
+    cv2, data = opencv(), np.frombuffer(read_bytes(file, what="mask"), np.uint8)
     # As stored: a conversion to 8 bits would make small numbers of 16, and all that alpha hides, count otherwise.
     picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if picture is None:

@@ -350,8 +350,7 @@ def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibra
     filmed, where = {}, calibration.where
     for name, size in sizes.items():
         posed = poses[name]
-        width, height = posed.size or size
-        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
+        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, size=posed.size or size, where=where)
         filmed[name] = LensCamera(at_picture_size(camera, size, name=name, where=where), posed.lens)
     _warn_of_sizes(filmed, poses, where)
     return filmed

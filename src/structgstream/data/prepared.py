@@ -225,8 +225,8 @@ def filmed_entry(filmed: LensCamera) -> dict[str, Any]:
 
 def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
     with readable(f"Camera {name!r} of {file}", EXPECTED):
-        width, height = pixels(entry["size"])
-        filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        size = pixels(entry["size"])
+        filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], size=size, where=file)
         parameters = {key: number(value) for key, value in entry["lens"].items() if key != "model"}
         kind = LENSES[entry["lens"]["model"]]
         if unknown := parameters.keys() - {own.name for own in fields(kind)}:  # type: ignore[arg-type]

@@ -71,7 +71,7 @@ class WithRoving(SourceWrapper):
         near, changed = NEAR_SHARE * self.rig[name].near, self._changed(frame)
         undistortion = Undistortion(shown.filmed, shown.pinhole)  # its grids are large: one for all, let go afterwards
         return tuple(
-            self._picture(file, own.pinhole, undistortion, scale=scale, near=near, changed=changed)
+            self._picture(file, replace(own.pinhole.scaled(scale), near=near), undistortion, changed)
             for file, own in self.pictures
         )
 
@@ -84,14 +84,7 @@ class WithRoving(SourceWrapper):
         return hull_points(self.rig, self._changed(frame))
 
     def _picture(
-        self,
-        file: Path,
-        pinhole: Camera,
-        undistortion: Undistortion,
-        *,
-        scale: float,
-        near: float,
-        changed: Mapping[str, NDArray[np.bool_]],
+        self, file: Path, camera: Camera, undistortion: Undistortion, changed: Mapping[str, NDArray[np.bool_]]
     ) -> RovingPicture:
         picture = read_picture(file)
         filmed = undistortion.filmed.camera
@@ -100,7 +93,6 @@ class WithRoving(SourceWrapper):
                 f"The roving picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, expected {filmed.width}x"
                 f"{filmed.height}; prepare the capture again."
             )
-        camera = replace(pinhole.scaled(scale), near=near)
         size = camera.width, camera.height
         image = opencv().resize(undistortion(picture), size, interpolation=opencv().INTER_AREA)
         shown = np.ones(image.shape[:2], bool) if undistortion.shown is None else reduced_mask(undistortion.shown, size)

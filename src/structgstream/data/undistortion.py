@@ -247,13 +247,12 @@ class UndistortedSource(WithRig):
     """
 
     filmed: Mapping[str, LensCamera]
-    _plans: dict[str, Undistortion | None] = field(default_factory=dict, init=False, repr=False, compare=False)
     _masks: dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        plans = {name: self._plan(name) for name in self.rig}
+        plans = self.plans
 
         def pinhole(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
             return picture if (plan := plans[name]) is None else plan(picture)
@@ -270,14 +269,19 @@ class UndistortedSource(WithRig):
         """The same frames at the sizes of ``rig``, resampled once."""
         return replace(self, other=rig)
 
-    def is_unchanged(self, name: str) -> bool:
-        """Whether the pictures of a camera are passed through."""
-        filmed = self.filmed[name]
-        return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
+    @cached_property
+    def plans(self) -> Mapping[str, Undistortion | None]:
+        """What resamples the pictures of each camera; None for those that are passed through."""
+
+        def changes(name: str) -> bool:
+            filmed = self.filmed[name]
+            return not (isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K))
+
+        return {name: Undistortion(self.filmed[name], self.rig[name]) if changes(name) else None for name in self.rig}
 
     def _mask(self, name: str, given: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Which pixels of the pinhole count: those that the lens shows and that no mask of its picture leaves out."""
-        plan = self._plan(name)
+        plan = self.plans[name]
         if plan is None or given is None:
             return given if plan is None else plan.shown
         known = self._masks.get(name)
@@ -285,11 +289,6 @@ class UndistortedSource(WithRig):
             mask = plan.mask(given)
             known = self._masks[name] = (given, mask if plan.shown is None else mask & plan.shown)
         return known[1]
-
-    def _plan(self, name: str) -> Undistortion | None:
-        if name not in self._plans:
-            self._plans[name] = None if self.is_unchanged(name) else Undistortion(self.filmed[name], self.rig[name])
-        return self._plans[name]
 
 
 def lenses_of(source: FrameSource) -> Mapping[str, LensCamera] | None:
@@ -325,4 +324,4 @@ def undistort(
 def undistorted_to(pinholes: CameraRig, source: FrameSource, filmed: Mapping[str, LensCamera]) -> FrameSource:
     """``source``, taken with lenses, for these pinholes; the source itself if that changes nothing."""
     made = UndistortedSource(source, pinholes, filmed)
-    return source if all(made.is_unchanged(name) for name in pinholes) else made
+    return made if any(made.plans.values()) else source
