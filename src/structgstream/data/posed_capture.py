@@ -186,16 +186,8 @@ def of_pictures(
     sizes = {name: _shown_size(file, turns[name]) for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, poses, calibration, path)
-    source = ImageSource(
-        path.name,
-        rig,
-        PICTURE_FPS if fps is None else fps,
-        common,
-        calibration.points,
-        instants,
-        turns=turns,
-    )
-    return source, filmed
+    rate = PICTURE_FPS if fps is None else fps
+    return ImageSource(path.name, rig, rate, common, calibration.points, instants, turns=turns), filmed
 
 
 def _shown_size(file: Path, orientation: int) -> tuple[int, int]:

@@ -65,7 +65,7 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
 
 
 def check_field_of_view(degrees: float) -> None:
-    """Refuses what is no angle across a plane."""
+    """Check an angle across a plane. Raises ConfigError."""
     if not 0 < degrees < 175:
         raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
 
@@ -118,8 +118,7 @@ SCALE_SAMPLES = 33
 class Level:
     """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid."""
 
-    rows: slice  # of the pinhole's picture
-    columns: slice  # of the pinhole's picture
+    part: tuple[slice, slice]  # rows and columns of the pinhole's picture
     maps: tuple[NDArray[np.generic], NDArray[np.generic]]
     """Source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel."""
     weights: NDArray[np.float32] | None
@@ -141,18 +140,17 @@ class Undistortion:
     def __call__(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """``[H, W, 3]`` of the lens to ``[H, W, 3]`` of the pinhole; black where the lens shows nothing."""
         cv2 = opencv()
-        result = None
+        result = picture
         for number, level in enumerate(self._levels):
             size = self._size(number)
             if picture.shape[1::-1] != size:
                 picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
             taken = cv2.remap(picture, *level.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            if result is None or level.weights is None:
+            if level.weights is None:
                 result = taken
             else:
-                finer = result[level.rows, level.columns]
-                result[level.rows, level.columns] = cv2.blendLinear(finer, taken, 1 - level.weights, level.weights)
-        assert result is not None
+                blended = cv2.blendLinear(result[level.part], taken, 1 - level.weights, level.weights)
+                result[level.part] = blended
         if self.shown is not None:
             result[~self.shown] = 0
         return result
@@ -166,8 +164,7 @@ class Undistortion:
             # Bicubic sampling reads from one pixel before to two behind.
             whole = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
             taken = cv2.remap(whole, *level.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
-            used = np.ones(taken.shape, bool) if level.weights is None else level.weights > 0
-            result[level.rows, level.columns] &= taken | ~used
+            result[level.part] &= taken if level.weights is None else taken | (level.weights <= 0)
         return result
 
     @cached_property
@@ -197,7 +194,7 @@ class Undistortion:
         # Beyond the lens any place will do: those pixels become black.
         found = np.clip(np.nan_to_num(found, nan=-1.0), -1, (width, height)).astype(np.float32)
         maps = cv2.convertMaps(found[..., 0], found[..., 1], cv2.CV_16SC2)
-        return Level(*part, maps, share[part].astype(np.float32) if number else None)
+        return Level(part, maps, share[part].astype(np.float32) if number else None)
 
     def _size(self, number: int) -> tuple[int, int]:
         """The size of the lens's picture after so many halvings; at first it is reduced as far as nothing is lost."""
@@ -208,16 +205,14 @@ class Undistortion:
     @cached_property
     def _min_scale(self) -> float:
         """Least pixels of the lens, along any direction, in a pixel of the pinhole."""
-        across = np.linspace(1, self.target.width - 1, SCALE_SAMPLES)
-        down = np.linspace(1, self.target.height - 1, SCALE_SAMPLES)
-        pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
+        sides = (np.linspace(1, side - 1, SCALE_SAMPLES) for side in (self.target.width, self.target.height))
+        pixels = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
         straight = LensCamera(self.target, Pinhole())
-        steps = [
-            self.filmed.to_pixels(straight.to_normalized(pixels + axis))
-            - self.filmed.to_pixels(straight.to_normalized(pixels - axis))
-            for axis in np.eye(2) / 2
-        ]
-        jacobians = np.stack(steps, -1)
+
+        def filmed(moved: Floats) -> Floats:
+            return self.filmed.to_pixels(straight.to_normalized(pixels + moved))
+
+        jacobians = np.stack([filmed(axis) - filmed(-axis) for axis in np.eye(2) / 2], -1)
         jacobians = jacobians[np.isfinite(jacobians).all((-1, -2))]
         return float(np.linalg.svd(jacobians, compute_uv=False).min()) if len(jacobians) else 1.0
 
