@@ -8,6 +8,7 @@ import shutil
 import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from tests.support.captures import (
     picture,
     small_rig,
     write_picture,
+    write_pictures,
     write_text_model,
     write_videos,
 )
@@ -52,12 +54,7 @@ def check_opens(folder: Path, *, frames: int = 2, names: tuple[str, ...] = NAMES
     assert [numbers(shown[name])[0] for name in names] == list(range(len(names)))
 
 
-def pictures(folder: Path, pattern: str) -> None:
-    for camera, name in enumerate(NAMES):
-        for frame in range(2):
-            write_picture(
-                folder / pattern.replace("CAM", name).replace("FRAME", f"{frame:06d}"), picture(camera, frame)
-            )
+pictures = partial(write_pictures, names=NAMES, frames=2)
 
 
 def model(folder: Path) -> None:
@@ -184,9 +181,8 @@ def test_the_lens_model_is_what_a_file_calls_it(
         entry[key] = value
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     if lens is None:
-        with pytest.raises(
-            CalibrationError, match=r"'cam00' of .*\(the lens model omnidirectional, which is not known"
-        ):
+        words = r"'cam00' of .*\(the lens model omnidirectional, which is not known"
+        with pytest.raises(CalibrationError, match=words):
             read_calibration(tmp_path)
         return
     found = read_calibration(tmp_path)
@@ -242,9 +238,8 @@ def test_one_picture_a_camera_beside_maps_of_the_same_names(tmp_path: Path, besi
 def test_poses_without_intrinsics_are_no_projection_matrices(tmp_path: Path) -> None:
     for camera in PINHOLES:
         np.savetxt(tmp_path / f"{camera.name}.txt", np.column_stack([camera.R, camera.T]))
-    with pytest.raises(
-        CalibrationError, match=r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
-    ):
+    words = r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
+    with pytest.raises(CalibrationError, match=words):
         read_calibration(tmp_path)
 
 
@@ -262,9 +257,8 @@ def test_pieces_of_videos(tmp_path: Path) -> None:
     for name in NAMES:
         (tmp_path / name).mkdir()
         (tmp_path / name / "chunk-stream0-00001.m4s").write_bytes(b"styp")
-    with pytest.raises(
-        CaptureError, match=r"cam00.chunk-stream0-00001.m4s is a piece of a video: join the pieces of each"
-    ):
+    words = r"cam00.chunk-stream0-00001.m4s is a piece of a video: join the pieces of each"
+    with pytest.raises(CaptureError, match=words):
         open_capture(tmp_path)
 
 
@@ -296,13 +290,8 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
 
     def matrix(value: Any) -> dict[str, Any]:
         rows = np.atleast_2d(value)
-        return {
-            "type_id": "opencv-matrix",
-            "rows": len(rows),
-            "cols": rows.shape[1],
-            "dt": "d",
-            "data": rows.ravel().tolist(),
-        }
+        own = {"rows": len(rows), "cols": rows.shape[1], "dt": "d", "data": rows.ravel().tolist()}
+        return {"type_id": "opencv-matrix", **own}
 
     (tmp_path / "settings.yaml").write_text("%YAML:1.0\nCamera.fx: 500\n")
     entries = {}
@@ -313,16 +302,12 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
             text = f"%YAML:1.0\n---\nimage_Width: {WIDTH}\nImageHeight: {HEIGHT}\n"
             (tmp_path / f"{truth.name}.yml").write_text(text + "".join(opencv_matrix(*pair) for pair in values.items()))
         elif form == "json":
-            content = {
-                "image_size": {"width": WIDTH, "height": HEIGHT},
-                **{key: matrix(own) for key, own in values.items()},
-            }
+            size = {"image_size": {"width": WIDTH, "height": HEIGHT}}
+            content = size | {key: matrix(own) for key, own in values.items()}
             (tmp_path / f"{truth.name}.json").write_text(json.dumps(content))
         else:
-            entries[truth.name] = {
-                "size": [WIDTH, HEIGHT],
-                **{key: np.array(own).tolist() for key, own in values.items()},
-            }
+            own = {key: np.array(own).tolist() for key, own in values.items()}
+            entries[truth.name] = {"size": [WIDTH, HEIGHT], **own}
             if form == "plain.yaml":
                 (tmp_path / f"{truth.name}.yaml").write_text(json.dumps(entries[truth.name]))
     if form == "list.yaml":
@@ -338,12 +323,8 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
 def test_what_file_servers_and_systems_leave_is_no_picture(tmp_path: Path) -> None:
     pictures(tmp_path, "images/CAM/FRAME.png")
     model(tmp_path / "sparse/0")
-    for stray in (
-        "@eaDir/thumb.jpg",
-        "cam00/@eaDir/000000.png/SYNOPHOTO.jpg",
-        "cam00/000003.png/a.png",
-        "__MACOSX/a.png",
-    ):
+    stray_files = "@eaDir/thumb.jpg cam00/@eaDir/000000.png/SYNOPHOTO.jpg cam00/000003.png/a.png __MACOSX/a.png"
+    for stray in stray_files.split():
         write_picture(tmp_path / "images" / stray, picture(7, 7))
     check_opens(tmp_path)
 
@@ -385,7 +366,6 @@ def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFix
     write_text_model(tmp_path / "sparse/0", RIG, [("cam00.png", "cam00"), ("cam01.png", "cam01")])
     check_opens(tmp_path)
     assert "several models: number 1 of 3 pictures is taken, number 0 of 2 left out" in caplog.text
-    caplog.clear()
 
 
 @pytest.mark.parametrize("tool", ["anipose", "easymocap", "multical", "cmu_panoptic", "opencv_cameras", "openpose"])
@@ -448,7 +428,6 @@ def test_a_camera_without_a_pose_is_left_out(tmp_path: Path, caplog: pytest.LogC
     with caplog.at_level(logging.WARNING):
         check_opens(tmp_path, names=NAMES[:2])
     assert "has no pose of camera 'cam02'; left out" in caplog.text
-    caplog.clear()
 
 
 def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -456,4 +435,3 @@ def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture
     calibrated(tmp_path, truths(names=("left_2", "left_1", "left_0"), dist=(0, 0, 0, 0)))
     assert list(open_capture(tmp_path).rig) == ["right_0", "right_1", "right_2"]
     assert "cameras are matched by their numbers alone: right_0 is 'left_0'" in caplog.text
-    caplog.clear()
