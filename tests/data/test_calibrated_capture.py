@@ -15,26 +15,12 @@ from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError
 from structgstream.pose_check.check import check_poses
-from tests.support.calibrations import (
-    WRITERS,
-    Floats,
-    Truth,
-    truths,
-    write_anipose,
-    write_easymocap,
-)
-from tests.support.captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
+from tests.support.calibrations import WRITERS, Floats, Truth, truths, write_anipose, write_easymocap
+from tests.support.captures import HEIGHT, WIDTH, Picture, all_numbers, write_picture, write_pictures, write_videos
 from tests.support.small_clip import CAMERAS
 
 NAMES = ["cam00", "cam01", "cam02"]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]
-
-
-def write_pictures(path: Path, pattern: str = "images/NAME/FRAME.png") -> None:
-    for number, name in enumerate(NAMES):
-        for frame in range(3):
-            file = pattern.replace("NAME", name).replace("FRAME", f"{frame:06d}")
-            write_picture(path / file, picture(number, frame))
 
 
 @pytest.mark.parametrize(
@@ -48,7 +34,7 @@ def test_every_tool_with_pictures_or_videos(tool: str, videos: bool, tmp_path: P
     if videos:
         write_videos(tmp_path / ("hdVideos" if tool == "cmu_panoptic" else ""), names, frames=3)
     else:
-        write_pictures(tmp_path)
+        write_pictures(tmp_path, "images/CAM/FRAME.png", NAMES, frames=3)
     source = open_capture(tmp_path)
     assert isinstance(source, UndistortedSource)
     assert list(source.rig) == names
@@ -68,10 +54,9 @@ def test_every_tool_with_pictures_or_videos(tool: str, videos: bool, tmp_path: P
 def test_names_that_differ_in_form_are_matched_by_number(tmp_path: Path) -> None:
     write_anipose(tmp_path, truths(names=("Camera 2", "Camera 0", "Camera 1")))
     write_videos(tmp_path, ["port_0", "port_1", "port_2"], frames=2)
-    source = open_capture(tmp_path)
-    expected = {camera.name: camera.center for camera in truths(names=("port_2", "port_0", "port_1"))}
-    for name in source.rig:
-        np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name], atol=1e-6)
+    rig = open_capture(tmp_path).rig
+    for camera in truths(names=("port_2", "port_0", "port_1")):
+        np.testing.assert_allclose(rig[camera.name].center.numpy(), camera.center, atol=1e-6)
 
 
 def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
@@ -129,9 +114,8 @@ def test_half_of_easymocap(tmp_path: Path) -> None:
 def test_pickles_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cam0.pickle").write_bytes(pickle.dumps({"K": 1}))
     write_videos(tmp_path, NAMES, frames=2)
-    with pytest.raises(
-        CalibrationError, match=r"cam0\.pickle is a pickle, and opening it could run any program; it is"
-    ):
+    words = r"cam0\.pickle is a pickle, and opening it could run any program; it is"
+    with pytest.raises(CalibrationError, match=words):
         open_capture(tmp_path)
 
 

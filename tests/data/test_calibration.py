@@ -31,8 +31,8 @@ WHERE = Path("take/cameras.json")
 K = np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
 
 
-def camera(viewmat: object = np.eye(4), intrinsics: object = K, *, width: int = 64, height: int = 48) -> Camera:
-    return calibrated_camera("c7", viewmat=viewmat, K=intrinsics, width=width, height=height, where=WHERE)  # type: ignore[arg-type]
+def camera(viewmat: object = np.eye(4), intrinsics: object = K, *, size: tuple[int, int] = (64, 48)) -> Camera:
+    return calibrated_camera("c7", viewmat=viewmat, K=intrinsics, size=size, where=WHERE)  # type: ignore[arg-type]
 
 
 def test_three_rows_of_a_pose_are_enough() -> None:
@@ -62,7 +62,7 @@ def test_broken_numbers_name_the_camera_and_the_file(viewmat: object, intrinsics
 @pytest.mark.parametrize(("width", "height"), [(32, 24), (640, 480), (128, 96)])
 def test_intrinsics_of_another_picture_size_are_refused(width: int, height: int) -> None:
     with pytest.raises(CalibrationError, match=f"does not belong to a picture of {width}x{height}"):
-        camera(width=width, height=height)
+        camera(size=(width, height))
 
 
 def test_a_principal_point_off_centre_is_accepted() -> None:

@@ -11,15 +11,8 @@ import pytest
 from structgstream.data.camera_files import REPORT, videos_in
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
-from tests.support.captures import (
-    numbers,
-    picture,
-    write_clip,
-    write_n3dv,
-    write_picture,
-    write_text_model,
-    write_videos,
-)
+from tests.support import captures
+from tests.support.captures import numbers, picture, write_clip, write_n3dv, write_picture, write_videos
 
 
 def test_videos_in_folders_of_cameras(tmp_path: Path) -> None:
@@ -36,10 +29,10 @@ APPLE_DOUBLE = b"\0\5\x16\7"
 
 def colmap(where: Path) -> None:
     rig = write_n3dv(where / "poses")
-    write_text_model(where / "sparse", rig, [(f"{name}.png", name) for name in rig])
-    for number, name in enumerate(rig):
-        write_picture(where / name / "0.png", picture(number, 0))
-        (where / name / "._0.png").write_bytes(APPLE_DOUBLE)
+    captures.write_text_model(where / "sparse", rig, [(f"{name}.png", name) for name in rig])
+    captures.write_pictures(where, "CAM/FRAME.png", rig, frames=1)
+    for name in rig:
+        (where / name / "._000000.png").write_bytes(APPLE_DOUBLE)
 
 
 def test_what_a_mac_leaves_beside_files_is_no_camera_and_no_frame(tmp_path: Path) -> None:
@@ -65,6 +58,6 @@ def test_the_report_of_a_check_is_no_camera(tmp_path: Path) -> None:
 
 def test_a_picture_twice_is_not_chosen_by_chance(tmp_path: Path) -> None:
     colmap(tmp_path)
-    write_picture(tmp_path / "cam01" / "0.jpg", picture(0, 0))
-    with pytest.raises(CaptureError, match=r"0\.jpg and 0\.png in .*cam01 are of one name"):
+    write_picture(tmp_path / "cam01" / "000000.jpg", picture(0, 0))
+    with pytest.raises(CaptureError, match=r"000000\.jpg and 000000\.png in .*cam01 are of one name"):
         open_capture(tmp_path)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,19 +9,16 @@ import torch
 
 from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, CaptureError
+from tests.support import captures
 from tests.support.captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 
 RIG = small_rig(3)
 FRAMES = 4
+MODEL = [(f"{name}.png", name) for name in RIG]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(FRAMES)]
 
 
-def write_pictures(path: Path, pattern: str) -> None:
-    """One picture per camera and frame, at ``pattern`` with CAM and FRAME replaced."""
-    for number, name in enumerate(RIG):
-        for frame in range(FRAMES):
-            file = pattern.replace("CAM", name).replace("FRAME", f"{frame:06d}")
-            write_picture(path / file, picture(number, frame))
+write_pictures = partial(captures.write_pictures, names=RIG, frames=FRAMES)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +62,7 @@ def test_frames_and_cameras_of_the_same_numbers(tmp_path: Path, root: str, frame
 @pytest.mark.parametrize("folder", ["", "videos"])
 def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
     write_videos(tmp_path / folder, list(RIG), frames=FRAMES)
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG], points=np.eye(3))
+    write_text_model(tmp_path / "sparse", RIG, MODEL, points=np.eye(3))
     write_picture(tmp_path / "images" / "cam00.png", picture(0, 0))  # what the model was made from
     source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
@@ -74,14 +72,13 @@ def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
 
 def test_a_missing_picture_is_an_absent_camera(tmp_path: Path) -> None:
     write_pictures(tmp_path, "frames/FRAME/CAM.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
+    write_text_model(tmp_path / "sparse", RIG, MODEL)
     (tmp_path / "frames/000002/cam01.png").unlink()
     absent = [set(RIG).difference(frame.images) for frame in open_capture(tmp_path).frames()]
     assert [index for index, names in enumerate(absent) if names] == [2]
     assert absent[2] == {"cam01"}
-    (
-        tmp_path / "frames/000000/cam02.png"
-    ).unlink()  # the range begins with it, and cam01's first picture is a later one
+    # The range begins with it, and cam01's first picture is a later one.
+    (tmp_path / "frames/000000/cam02.png").unlink()
     (tmp_path / "frames/000001/cam01.png").unlink()
     assert set(RIG).difference(next(open_capture(tmp_path).frames()).images) == {"cam01"}
 
@@ -91,7 +88,7 @@ def test_reduced_pictures_scale_the_intrinsics(tmp_path: Path, folder: str) -> N
     """257 / 4 is 64.25: the picture's own size counts, not the factor."""
     write_pictures(tmp_path / folder, "CAM/FRAME.png")
     large = RIG.mapped({name: RIG[name].resized(257, 193) for name in RIG})
-    write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
+    write_text_model(tmp_path / "sparse", large, MODEL)
     source = open_capture(tmp_path)
     for name in RIG:
         torch.testing.assert_close(source.rig[name].K, RIG[name].K)
@@ -103,10 +100,9 @@ def test_full_pictures_are_preferred_to_reduced_ones(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     for number, name in enumerate(RIG):
         for frame in range(FRAMES):
-            write_picture(
-                tmp_path / "images_2" / name / f"{frame:06d}.png", picture(number, frame, width=32, height=24)
-            )
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
+            small = picture(number, frame, width=32, height=24)
+            write_picture(tmp_path / "images_2" / name / f"{frame:06d}.png", small)
+    write_text_model(tmp_path / "sparse", RIG, MODEL)
     assert open_capture(tmp_path).rig["cam00"].width == 64
 
 
@@ -126,7 +122,7 @@ def test_photos_that_the_model_could_not_place_are_left_out(tmp_path: Path, capl
     for number, name in enumerate(RIG):
         write_picture(tmp_path / "images" / f"{name}.png", picture(number, 7))
     write_picture(tmp_path / "images/blurred.png", picture(9, 7))
-    write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}.png", name) for name in RIG])
+    write_text_model(tmp_path / "sparse/0", RIG, MODEL)
     assert list(open_capture(tmp_path).rig) == list(RIG)
     assert "has no pose of camera 'blurred' of " in caplog.text
 
@@ -138,7 +134,7 @@ def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> Non
         write_videos(tmp_path, list(RIG), frames=FRAMES)
     else:
         write_pictures(tmp_path, "images/CAM/FRAME.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG], points=np.eye(3))
+    write_text_model(tmp_path / "sparse", RIG, MODEL, points=np.eye(3))
     lenses = ["OPENCV 64 48 40 40 32 24 -0.05 0.01 0.001 0", "OPENCV_FISHEYE 64 48 40 40 32 24 0.01 0 0 0"]
     cameras = [f"{number} {lens}" for number, lens in enumerate([*lenses, "PINHOLE 64 48 40 40 32 24"], start=1)]
     (tmp_path / "sparse/cameras.txt").write_text("\n".join(cameras))
@@ -153,7 +149,7 @@ def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> Non
 
 
 def test_a_model_without_frames(tmp_path: Path) -> None:
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
+    write_text_model(tmp_path / "sparse", RIG, MODEL)
     with pytest.raises(CaptureError, match="has the calibration .*sparse but no frames"):
         open_capture(tmp_path)
 
@@ -163,7 +159,7 @@ def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
     for frame in range(FRAMES):
         write_picture(tmp_path / f"images/cam01/{frame:06d}.png", picture(1, frame, width=32, height=24))
     mixed = RIG.mapped({**RIG.cameras, "cam01": dataclasses.replace(RIG["cam01"].resized(32, 24))})
-    write_text_model(tmp_path / "sparse", mixed, [(f"{name}.png", name) for name in RIG])
+    write_text_model(tmp_path / "sparse", mixed, MODEL)
     source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
     assert next(source.frames()).images["cam01"].shape == (24, 32, 3)

@@ -8,6 +8,7 @@ import shutil
 import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pytest
 
 from structgstream.data.calibration import rigid, rotation_matrix
 from structgstream.data.lenses import Fisheye, RadialTangential, from_integer_centers
-from structgstream.data.open import open_capture, read_calibrated
+from structgstream.data.open import open_capture, read_calibration
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import (
     NAMES,
@@ -37,6 +38,7 @@ from tests.support.captures import (
     picture,
     small_rig,
     write_picture,
+    write_pictures,
     write_text_model,
     write_videos,
 )
@@ -52,12 +54,7 @@ def check_opens(folder: Path, *, frames: int = 2, names: tuple[str, ...] = NAMES
     assert [numbers(shown[name])[0] for name in names] == list(range(len(names)))
 
 
-def pictures(folder: Path, pattern: str) -> None:
-    for camera, name in enumerate(NAMES):
-        for frame in range(2):
-            write_picture(
-                folder / pattern.replace("CAM", name).replace("FRAME", f"{frame:06d}"), picture(camera, frame)
-            )
+pictures = partial(write_pictures, names=NAMES, frames=2)
 
 
 def model(folder: Path) -> None:
@@ -184,12 +181,11 @@ def test_the_lens_model_is_what_a_file_calls_it(
         entry[key] = value
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     if lens is None:
-        with pytest.raises(
-            CalibrationError, match=r"'cam00' of .*\(the lens model omnidirectional, which is not known"
-        ):
-            read_calibrated(tmp_path)
+        words = r"'cam00' of .*\(the lens model omnidirectional, which is not known"
+        with pytest.raises(CalibrationError, match=words):
+            read_calibration(tmp_path)
         return
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert {camera.lens for camera in found.cameras} == {lens(0.1, 0.02, 0.003, 0.001)}
 
@@ -199,7 +195,7 @@ def test_lists_of_words_are_no_matrices(tmp_path: Path, content: str) -> None:
     """Nine names look like a matrix of nine numbers."""
     (tmp_path / "take.yaml").write_text(content)
     calibrated(tmp_path)
-    assert read_calibrated(tmp_path) is not None
+    assert read_calibration(tmp_path) is not None
 
 
 def test_a_pose_that_is_written_by_columns_is_refused(tmp_path: Path) -> None:
@@ -242,10 +238,9 @@ def test_one_picture_a_camera_beside_maps_of_the_same_names(tmp_path: Path, besi
 def test_poses_without_intrinsics_are_no_projection_matrices(tmp_path: Path) -> None:
     for camera in PINHOLES:
         np.savetxt(tmp_path / f"{camera.name}.txt", np.column_stack([camera.R, camera.T]))
-    with pytest.raises(
-        CalibrationError, match=r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
-    ):
-        read_calibrated(tmp_path)
+    words = r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
+    with pytest.raises(CalibrationError, match=words):
+        read_calibration(tmp_path)
 
 
 @pytest.mark.parametrize("place", ["optimized/cameras", "meta/calib"])
@@ -262,9 +257,8 @@ def test_pieces_of_videos(tmp_path: Path) -> None:
     for name in NAMES:
         (tmp_path / name).mkdir()
         (tmp_path / name / "chunk-stream0-00001.m4s").write_bytes(b"styp")
-    with pytest.raises(
-        CaptureError, match=r"cam00.chunk-stream0-00001.m4s is a piece of a video: join the pieces of each"
-    ):
+    words = r"cam00.chunk-stream0-00001.m4s is a piece of a video: join the pieces of each"
+    with pytest.raises(CaptureError, match=words):
         open_capture(tmp_path)
 
 
@@ -296,13 +290,8 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
 
     def matrix(value: Any) -> dict[str, Any]:
         rows = np.atleast_2d(value)
-        return {
-            "type_id": "opencv-matrix",
-            "rows": len(rows),
-            "cols": rows.shape[1],
-            "dt": "d",
-            "data": rows.ravel().tolist(),
-        }
+        own = {"rows": len(rows), "cols": rows.shape[1], "dt": "d", "data": rows.ravel().tolist()}
+        return {"type_id": "opencv-matrix", **own}
 
     (tmp_path / "settings.yaml").write_text("%YAML:1.0\nCamera.fx: 500\n")
     entries = {}
@@ -313,22 +302,18 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
             text = f"%YAML:1.0\n---\nimage_Width: {WIDTH}\nImageHeight: {HEIGHT}\n"
             (tmp_path / f"{truth.name}.yml").write_text(text + "".join(opencv_matrix(*pair) for pair in values.items()))
         elif form == "json":
-            content = {
-                "image_size": {"width": WIDTH, "height": HEIGHT},
-                **{key: matrix(own) for key, own in values.items()},
-            }
+            size = {"image_size": {"width": WIDTH, "height": HEIGHT}}
+            content = size | {key: matrix(own) for key, own in values.items()}
             (tmp_path / f"{truth.name}.json").write_text(json.dumps(content))
         else:
-            entries[truth.name] = {
-                "size": [WIDTH, HEIGHT],
-                **{key: np.array(own).tolist() for key, own in values.items()},
-            }
+            own = {key: np.array(own).tolist() for key, own in values.items()}
+            entries[truth.name] = {"size": [WIDTH, HEIGHT], **own}
             if form == "plain.yaml":
                 (tmp_path / f"{truth.name}.yaml").write_text(json.dumps(entries[truth.name]))
     if form == "list.yaml":
         cameras = [{"name": name, **entry} for name, entry in entries.items()]
         (tmp_path / "rig.yaml").write_text(json.dumps({"cameras": cameras}))
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     for truth, camera in zip(truths(), found.cameras, strict=True):
         assert (camera.name, camera.size) == (truth.name, (WIDTH, HEIGHT))
@@ -338,12 +323,8 @@ def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None
 def test_what_file_servers_and_systems_leave_is_no_picture(tmp_path: Path) -> None:
     pictures(tmp_path, "images/CAM/FRAME.png")
     model(tmp_path / "sparse/0")
-    for stray in (
-        "@eaDir/thumb.jpg",
-        "cam00/@eaDir/000000.png/SYNOPHOTO.jpg",
-        "cam00/000003.png/a.png",
-        "__MACOSX/a.png",
-    ):
+    stray_files = "@eaDir/thumb.jpg cam00/@eaDir/000000.png/SYNOPHOTO.jpg cam00/000003.png/a.png __MACOSX/a.png"
+    for stray in stray_files.split():
         write_picture(tmp_path / "images" / stray, picture(7, 7))
     check_opens(tmp_path)
 
@@ -369,14 +350,14 @@ def test_calibrations_that_differ_are_refused(tmp_path: Path) -> None:
     turn = rotation_matrix(np.array([0.4, -1.2, 2.0]))
     elsewhere = [replace(own, R=own.R @ turn.T, T=2.5 * own.T - own.R @ turn.T @ [3.0, -1.0, 0.5]) for own in cameras]
     write_anipose(tmp_path, elsewhere).rename(tmp_path / "copy.toml")  # in another world and unit
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert found.where.name == "copy.toml"
     moved = [*cameras[:2], Truth("cam02", cameras[2].K, cameras[2].dist, cameras[2].R, cameras[2].T + 0.5)]
     write_anipose(tmp_path, moved).rename(tmp_path / "tuesday.toml")
     with pytest.raises(CalibrationError, match=r"several calibrations that differ, copy\.toml and tuesday\.toml"):
-        read_calibrated(tmp_path)
-    assert read_calibrated(tmp_path, tmp_path / "tuesday.toml") is not None
+        read_calibration(tmp_path)
+    assert read_calibration(tmp_path, tmp_path / "tuesday.toml") is not None
 
 
 def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -385,17 +366,16 @@ def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFix
     write_text_model(tmp_path / "sparse/0", RIG, [("cam00.png", "cam00"), ("cam01.png", "cam01")])
     check_opens(tmp_path)
     assert "several models: number 1 of 3 pictures is taken, number 0 of 2 left out" in caplog.text
-    caplog.clear()
 
 
 @pytest.mark.parametrize("tool", ["anipose", "easymocap", "multical", "cmu_panoptic", "opencv_cameras", "openpose"])
 def test_files_of_windows_editors(tool: str, tmp_path: Path) -> None:
     """A byte order mark and carriage returns change nothing."""
     WRITERS[tool](tmp_path, truths())
-    plain = read_calibrated(tmp_path)
+    plain = read_calibration(tmp_path)
     for file in tmp_path.iterdir():
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
-    marked = read_calibrated(tmp_path)
+    marked = read_calibration(tmp_path)
     assert plain is not None
     assert marked is not None
     for one, other in zip(plain.cameras, marked.cameras, strict=True):
@@ -405,10 +385,10 @@ def test_files_of_windows_editors(tool: str, tmp_path: Path) -> None:
 
 def test_kalibr_with_an_imu(tmp_path: Path) -> None:
     file = write_kalibr(tmp_path, truths())
-    plain = read_calibrated(tmp_path)
+    plain = read_calibration(tmp_path)
     file.write_text(f"%YAML:1.0\n---\n{file.read_text()}\nT_imu_body:\n  [1.0, 0.0, 0.0]\n")
     (tmp_path / "a_imu_chain.yaml").write_text("imu0:\n  update_rate: 200.0\n")
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert plain is not None
     assert found is not None
     assert [camera.name for camera in found.cameras] == ["cam0", "cam1", "cam2"]
@@ -425,7 +405,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
         own += "camera_group: 0\n" + opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
         text += f"camera_{number}:\n" + "".join(f"  {line}\n" for line in own.splitlines())
     (tmp_path / "calibrated_cameras_data.yml").write_text(text)
-    found = read_calibrated(tmp_path)
+    found = read_calibration(tmp_path)
     assert found is not None
     assert [camera.name for camera in found.cameras] == ["camera_0", "camera_1", "camera_2"]
     for truth, camera in zip(truths(), found.cameras, strict=True):
@@ -433,7 +413,7 @@ def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
     file = tmp_path / "calibrated_cameras_data.yml"
     file.write_text(file.read_text().replace("camera_group: 0", "camera_group: 1", 1))
     with pytest.raises(CalibrationError, match=r"data\.yml has 2 groups of cameras .*each with a world of its own"):
-        read_calibrated(tmp_path)
+        read_calibration(tmp_path)
 
 
 @pytest.mark.parametrize("written", ["", '"null"'])
@@ -448,7 +428,6 @@ def test_a_camera_without_a_pose_is_left_out(tmp_path: Path, caplog: pytest.LogC
     with caplog.at_level(logging.WARNING):
         check_opens(tmp_path, names=NAMES[:2])
     assert "has no pose of camera 'cam02'; left out" in caplog.text
-    caplog.clear()
 
 
 def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -456,4 +435,3 @@ def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture
     calibrated(tmp_path, truths(names=("left_2", "left_1", "left_0"), dist=(0, 0, 0, 0)))
     assert list(open_capture(tmp_path).rig) == ["right_0", "right_1", "right_2"]
     assert "cameras are matched by their numbers alone: right_0 is 'left_0'" in caplog.text
-    caplog.clear()

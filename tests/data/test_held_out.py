@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.camera_spacing import best_surrounded
 from structgstream.data.dataset_layouts import bundled_clip
-from structgstream.data.open import best_surrounded, open_capture
+from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, ConfigError
 from tests.support.captures import small_rig, write_clip
 from tests.support.properties import examples

@@ -14,16 +14,14 @@ from PIL.TiffImagePlugin import IFDRational
 
 from structgstream.data.images import ImageSource, StatedOptics, picture_size, read_exif
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
-from tests.support.captures import all_numbers, picture, small_rig, write_picture
+from tests.support.captures import all_numbers, picture, small_rig, write_picture, write_pictures
 
 
 @pytest.fixture
 def source(tmp_path: Path) -> ImageSource:
     rig = small_rig(3)
-    files = {name: tuple(tmp_path / name / f"{frame}.jpg" for frame in range(5)) for name in rig}
-    for number, name in enumerate(rig):
-        for frame, path in enumerate(files[name]):
-            write_picture(path, picture(number, frame))
+    write_pictures(tmp_path, "CAM/FRAME.jpg", rig, frames=5)
+    files = {name: tuple(tmp_path / name / f"{frame:06d}.jpg" for frame in range(5)) for name in rig}
     return ImageSource("take", rig, 25.0, files)
 
 
@@ -38,14 +36,14 @@ def test_frames_come_in_order_with_time_and_every_camera(source: ImageSource) ->
 
 def test_channels_are_red_green_blue(source: ImageSource, tmp_path: Path) -> None:
     orange = np.full((48, 64, 3), (250, 120, 10), np.uint8)
-    write_picture(tmp_path / "cam00" / "0.jpg", orange)
+    write_picture(tmp_path / "cam00" / "000000.jpg", orange)
     image = next(source.frames()).images["cam00"]
     np.testing.assert_allclose(image.mean(axis=(0, 1)), (250, 120, 10), atol=3)
 
 
 def test_a_picture_of_another_size_names_file_and_sizes(source: ImageSource, tmp_path: Path) -> None:
-    write_picture(tmp_path / "cam01" / "2.jpg", picture(1, 2, width=32, height=24))
-    with pytest.raises(CalibrationError, match=r"cam01/2\.jpg has 32x24 pixels.*64x48"):
+    write_picture(tmp_path / "cam01" / "000002.jpg", picture(1, 2, width=32, height=24))
+    with pytest.raises(CalibrationError, match=r"cam01/000002\.jpg has 32x24 pixels.*64x48"):
         list(source.frames())
 
 
@@ -53,7 +51,7 @@ def test_a_picture_of_another_size_names_file_and_sizes(source: ImageSource, tmp
 def test_an_unreadable_picture_is_named_after_the_frames_before_it(
     source: ImageSource, tmp_path: Path, damage: str
 ) -> None:
-    path = tmp_path / "cam02" / "3.jpg"
+    path = tmp_path / "cam02" / "000003.jpg"
     data = path.read_bytes()
     if damage == "gone":
         path.unlink()
@@ -61,7 +59,7 @@ def test_an_unreadable_picture_is_named_after_the_frames_before_it(
         path.write_bytes({"cut": data[: len(data) // 2], "empty": b"", "junk": b"\xff\xd8hello\xff\xd9"}[damage])
     frames = source.frames()
     assert [next(frames).index for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(CaptureError, match=r"cam02/3\.jpg cannot be (decoded|read)"):
+    with pytest.raises(CaptureError, match=r"cam02/000003\.jpg cannot be (decoded|read)"):
         next(frames)
 
 

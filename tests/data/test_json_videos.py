@@ -40,17 +40,21 @@ def test_a_calibration_without_video(tmp_path: Path) -> None:
         open_json_videos(tmp_path)
 
 
-def test_fewer_frames_than_stated(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"frames": 9}, CaptureError, r"share 6 frames, cameras\.json states 9"),
+        ({"fps": 25}, CaptureError, "states 25 frames a second, the time stamps of its videos say 30"),
+        ({"held_out": "cam00"}, CalibrationError, r"holds out 'cam00'; expected a list of names, \['cam00'\]"),
+        ({"fps": 0}, CaptureError, r"cameras\.json cannot be read \(fps[: ]"),
+        ({"fps": float("nan")}, CaptureError, r"cameras\.json cannot be read \(fps[: ]"),
+        ({"near": -1}, CaptureError, r"cameras\.json cannot be read \(near[: ]"),
+    ],
+)
+def test_values_that_cannot_be(tmp_path: Path, change: dict[str, Any], error: type[Exception], words: str) -> None:
     write_clip(tmp_path)
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(frames=9))
-    with pytest.raises(CaptureError, match=r"share 6 frames, cameras\.json states 9"):
-        open_json_videos(tmp_path)
-
-
-def test_another_rate_than_stated(tmp_path: Path) -> None:
-    write_clip(tmp_path)
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=25))
-    with pytest.raises(CaptureError, match="states 25 frames a second, the time stamps of its videos say 30"):
+    edit_json(tmp_path / "cameras.json", lambda content: content.update(change))
+    with pytest.raises(error, match=words):
         open_json_videos(tmp_path)
 
 
@@ -62,21 +66,6 @@ def test_a_matrix_column_by_column(tmp_path: Path, key: str) -> None:
         lambda content: content["cameras"]["cam01"].update({key: [*zip(*content["cameras"]["cam01"][key])]}),
     )
     with pytest.raises(CalibrationError, match="Camera 'cam01' of .*cameras.json: The last row of the .* transpose"):
-        open_json_videos(tmp_path)
-
-
-def test_a_name_in_place_of_a_list(tmp_path: Path) -> None:
-    write_clip(tmp_path)
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(held_out="cam00"))
-    with pytest.raises(CalibrationError, match=r"holds out 'cam00'; expected a list of names, \['cam00'\]"):
-        open_json_videos(tmp_path)
-
-
-@pytest.mark.parametrize("change", [{"fps": 0}, {"fps": float("nan")}, {"near": -1}])
-def test_numbers_that_cannot_be(tmp_path: Path, change: dict[str, float]) -> None:
-    write_clip(tmp_path)
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(change))
-    with pytest.raises(CaptureError, match=rf"cameras\.json cannot be read \({next(iter(change))}[: ]"):
         open_json_videos(tmp_path)
 
 

@@ -172,10 +172,8 @@ def test_masks_of_a_prepared_capture_are_named_as_the_cameras_pictures(tmp_path:
     write_mask(tmp_path / "masks/cam00/003.png", np.zeros((HEIGHT, WIDTH), bool))
     write_mask(tmp_path / "masks/cam01/003.png", np.zeros((HEIGHT, WIDTH), bool))
     frames = list(open_capture(tmp_path).frames())
-    assert {(name, frame.index) for frame in frames for name in frame.masks} == {
-        ("cam00", 1),
-        ("cam01", 2),
-    }  # Frame 0 has the pictures 002, and 001 of the late one.
+    # Frame 0 has the pictures 002, and 001 of the late one.
+    assert {(name, frame.index) for frame in frames for name in frame.masks} == {("cam00", 1), ("cam01", 2)}
 
 
 @pytest.mark.parametrize("size", [(32, 24), (21, 17), (64, 48)])
@@ -251,8 +249,7 @@ def test_masks_that_do_not_belong_are_refused(tmp_path: Path, name: str, words: 
 
 def test_masks_as_a_video_are_refused(tmp_path: Path) -> None:
     write_clip(tmp_path, frames=3)
-    (tmp_path / "masks").mkdir()
-    (tmp_path / "masks/cam01.mp4").write_bytes((tmp_path / "cam01.mp4").read_bytes())
+    write_videos(tmp_path / "masks", ["cam01"])
     with pytest.raises(CaptureError, match=r"cam01\.mp4 is no PNG"):
         open_capture(tmp_path)
 

@@ -17,6 +17,7 @@ from tests.support.captures import (
     write_meet_room,
     write_n3dv,
     write_picture,
+    write_pictures,
     write_text_model,
 )
 
@@ -60,13 +61,9 @@ POINTS = np.array([[0.1, 0.2, 0.3], [-0.5, 0.25, 1.0]])
 
 @pytest.mark.parametrize(
     ("folder", "pattern"),
-    [
-        ("sparse/0", "{}.png"),
-        ("colmap/sparse/0", "{}"),
-        ("colmap_0/sparse/0", "{}/000017.png"),
-        ("sparse/0", "images/{}/1.jpg"),
-    ],
-)
+    [("sparse/0", "{}.png"), ("colmap/sparse/0", "{}"), ("colmap_0/sparse/0", "{}/000017.png"),
+     ("sparse/0", "images/{}/1.jpg")],
+)  # fmt: skip
 def test_points_of_a_model_with_the_same_poses(tmp_path: Path, folder: str, pattern: str) -> None:
     """Three cameras of the rig by name are enough; several pictures of one and other cameras are no obstacle."""
     rig = write_n3dv(tmp_path)
@@ -164,10 +161,9 @@ def test_the_pictures_tell_the_order_of_rows(tmp_path: Path, as_text: bool) -> N
 def test_decoded_pictures(tmp_path: Path) -> None:
     """4DGaussians leaves camXX/images/FRAME.png."""
     rig = write_n3dv(tmp_path)
-    for camera, name in enumerate(rig):
-        (tmp_path / f"{name}.mp4").unlink()
-        for frame in range(2):
-            write_picture(tmp_path / name / f"images/{frame:04d}.png", picture(camera, frame))
+    for file in tmp_path.glob("*.mp4"):
+        file.unlink()
+    write_pictures(tmp_path, "CAM/images/FRAME.png", rig, frames=2)
     source = open_n3dv(tmp_path)
     assert (source.rig.testing, len(source)) == (("cam00",), 2)
     assert all_numbers(source.frames(1)) == [[(camera, 1) for camera in range(4)]]
@@ -176,10 +172,10 @@ def test_decoded_pictures(tmp_path: Path) -> None:
 def test_one_picture_a_camera(tmp_path: Path) -> None:
     """As LLFF and mip-NeRF 360 are published, with reduced copies."""
     rig = write_n3dv(tmp_path)
-    for camera, name in enumerate(rig):
-        (tmp_path / f"{name}.mp4").unlink()
-        for folder in ("images", "images_4"):
-            write_picture(tmp_path / folder / f"{name}.JPG", picture(camera, 0))
+    for file in tmp_path.glob("*.mp4"):
+        file.unlink()
+    for folder in ("images", "images_4"):
+        write_pictures(tmp_path / folder, "CAM.JPG", rig, frames=1)
     source = open_n3dv(tmp_path)
     assert all_numbers(source.frames()) == [[(camera, 0) for camera in range(4)]]
     torch.testing.assert_close(source.rig["cam03"].viewmat, rig["cam03"].viewmat)

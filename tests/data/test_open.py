@@ -17,6 +17,7 @@ from tests.support.captures import (
     write_n3dv,
     write_panoptic,
     write_picture,
+    write_pictures,
     write_shared_intrinsics,
     write_text_model,
     write_videos,
@@ -25,20 +26,12 @@ from tests.support.captures import (
 
 def write_colmap(path: Path) -> CameraRig:
     rig = small_rig()
-    for number, name in enumerate(rig):
-        for frame in range(4):
-            write_picture(path / "images" / name / f"{frame}.png", picture(number, frame))
+    write_pictures(path, "images/CAM/FRAME.png", rig, frames=4)
     write_text_model(path / "sparse" / "0", rig, [(f"{name}.png", name) for name in rig], points=np.eye(3))
     return rig
 
 
-WRITERS = [
-    write_panoptic,
-    write_clip,
-    write_shared_intrinsics,
-    write_n3dv,
-    write_colmap,
-]
+WRITERS = [write_panoptic, write_clip, write_shared_intrinsics, write_n3dv, write_colmap]
 
 
 @pytest.mark.parametrize("write", WRITERS)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which frame serves which instant: properties of the choice, and rates of made time stamps."""
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -44,17 +43,64 @@ def test_times_in_names_sort_by_value_whatever_their_number_of_decimals() -> Non
     }
 
 
-def test_a_late_start_and_an_early_end_cut_the_range_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        assert common(a=[0, 1, 2, 3], b=[1, 2, 3, 4, 5]) == range(1, 4)
-    first, second = (record.getMessage() for record in caplog.records)
-    assert "'b' starts with frame 1; 1 earlier" in first
-    assert "'a' ends with frame 3; 2 later" in second
+WHOLE = list(range(10))
 
 
-def test_equal_cameras_warn_of_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    assert common(a=[4, 5], b=[4, 5]) == range(4, 6)
-    assert not caplog.records
+@pytest.mark.parametrize(
+    ("slots", "expected", "messages"),
+    [
+        (
+            {"a": [0, 1, 2, 3], "b": [1, 2, 3, 4, 5]},
+            range(1, 4),
+            [
+                "camera 'b' starts with frame 1; 1 earlier frames of other cameras are left out",
+                "camera 'a' ends with frame 3; 2 later frames of other cameras are left out",
+            ],
+        ),
+        ({"a": [4, 5], "b": [4, 5]}, range(4, 6), []),
+        (
+            {"a": [0, 1, 2, 3, 4], "b": [0, 1, 4], "c": [0, 1, 2, 3, 4]},
+            range(5),
+            ["camera 'b' lacks 2 of 5 frames, the first of them frame 2; it is absent there"],
+        ),
+        (
+            {"a": [0, 2, 3, 4], "b": [0, 1, 4], "c": [0, 1, 3, 4], "d": [0, 1, 2, 3, 4]},
+            range(5),
+            ["3 cameras lack some of 5 frames and are absent there: 'a' 1, 'b' 2, 'c' 1"],
+        ),
+        (  # half of them still run
+            {"a": WHOLE, "b": WHOLE, "c": WHOLE[:4], "d": WHOLE[:4]},
+            range(10),
+            [f"camera '{name}' ends with frame 3; it is absent from the 6 frames after that" for name in "cd"],
+        ),
+        (
+            {"a": WHOLE, "b": WHOLE, "c": WHOLE[:4], "d": WHOLE[:5], "e": WHOLE[:6]},
+            range(6),
+            [
+                "camera 'e' ends with frame 5; 4 later frames of other cameras are left out",
+                "camera 'c' ends with frame 3; it is absent from the 2 frames after that",
+                "camera 'd' ends with frame 4; it is absent from the 1 frames after that",
+            ],
+        ),
+        (  # a frame that nearly nobody has
+            {"a": [0, 1, 3], "b": [0, 1, 3], "c": [0, 1, 2, 3]},
+            range(4),
+            [
+                *(
+                    f"camera '{name}' lacks 1 of 4 frames, the first of them frame 2; it is absent there"
+                    for name in "ab"
+                ),
+                "1 frames, the first of them frame 2, have pictures of fewer than 2 training cameras, so a "
+                "reconstruction stops there; restore them, or choose frames before or after",
+            ],
+        ),
+    ],
+)
+def test_the_range_ends_where_most_have_ended_and_what_is_left_out_is_reported(
+    slots: dict[str, list[int]], expected: range, messages: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert common(**slots) == expected
+    assert [record.getMessage() for record in caplog.records] == [f"take: {message}" for message in messages]
 
 
 @pytest.mark.parametrize(
@@ -70,41 +116,11 @@ def test_a_broken_timeline_names_camera_and_instant(b: list[int], words: str) ->
         common(a=[0, 1, 2, 3], b=b)
 
 
-def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records]
-
-
-def test_a_hole_is_reported_once_and_the_range_stays(caplog: pytest.LogCaptureFixture) -> None:
-    assert common(a=[0, 1, 2, 3, 4], b=[0, 1, 4], c=[0, 1, 2, 3, 4]) == range(5)
-    assert messages(caplog) == ["take: camera 'b' lacks 2 of 5 frames, the first of them frame 2; it is absent there"]
-
-
-def test_of_many_cameras_with_holes_one_line_tells(caplog: pytest.LogCaptureFixture) -> None:
-    assert common(a=[0, 2, 3, 4], b=[0, 1, 4], c=[0, 1, 3, 4], d=[0, 1, 2, 3, 4]) == range(5)
-    assert messages(caplog) == ["take: 3 cameras lack some of 5 frames and are absent there: 'a' 1, 'b' 2, 'c' 1"]
-
-
-def test_the_range_ends_where_most_cameras_have_ended(caplog: pytest.LogCaptureFixture) -> None:
-    whole = list(range(10))
-    assert common(a=whole, b=whole, c=whole[:4], d=whole[:4]) == range(10)  # half of them still run
-    assert messages(caplog) == [
-        f"take: camera '{name}' ends with frame 3; it is absent from the 6 frames after that" for name in "cd"
-    ]
-    caplog.clear()
-    assert common(a=whole, b=whole, c=whole[:4], d=whole[:5], e=whole[:6]) == range(6)
-    assert "'e' ends with frame 5; 4 later" in caplog.text
-
-
 def test_two_training_cameras_reach_the_end() -> None:
     slots = {"held": [*range(10)], "a": [*range(10)], "b": [*range(4)], "c": [*range(3)]}
     label = "frame {}".format
     assert common_slots(slots, where="take", label=label, training=("a", "b", "c")) == range(4)
     assert common(**slots) == range(10)
-
-
-def test_frames_that_nobody_has_are_reported(caplog: pytest.LogCaptureFixture) -> None:
-    assert common(a=[0, 1, 3], b=[0, 1, 3], c=[0, 1, 2, 3]) == range(4)
-    assert "1 frames, the first of them frame 2, have pictures of fewer than 2 training cameras" in caplog.text
 
 
 def test_a_camera_that_ended_before_the_others_began_belongs_to_another_take() -> None:

@@ -180,7 +180,7 @@ def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
             error = np.abs(frame.images[name].astype(float) - wanted[name] // (frame.index + 1))
             assert error.mean() < 1
             assert torch.equal(made.rig[name].viewmat, source.rig[name].viewmat)
-    assert made._plan("cam00").shown is None  # type: ignore[union-attr]
+    assert made.plans["cam00"].shown is None  # type: ignore[union-attr]
     assert [frame.index for frame in made.frames(1)] == [1]
 
 

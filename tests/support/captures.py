@@ -3,7 +3,7 @@
 
 import json
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -122,6 +122,14 @@ def write_picture(path: Path, image: Picture) -> None:
     """A picture file, with quality enough for its numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def write_pictures(folder: Path, pattern: str, names: Iterable[str], *, frames: int) -> None:
+    """Pictures of each camera and frame, at ``pattern`` with CAM and FRAME, of six digits, replaced."""
+    for camera, name in enumerate(names):
+        for frame in range(frames):
+            file = pattern.replace("CAM", name).replace("FRAME", f"{frame:06d}")
+            write_picture(folder / file, picture(camera, frame))
 
 
 def edit_json(file: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -92,23 +92,23 @@ def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
-def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path) -> Camera:
-    """One camera of the calibration file ``where``, for pictures of ``width`` x ``height`` pixels.
+def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, size: tuple[int, int], where: Path) -> Camera:
+    """One camera of the calibration file ``where``.
 
     Args:
         viewmat: ``[4, 4]`` or ``[3, 4]``, world to camera, OpenCV axes.
         K: ``[3, 3]`` intrinsics, pixels.
+        size: width and height of the pictures, pixels.
 
     Raises:
         CalibrationError: invalid values (see :class:`Camera`), a pose written by columns, or a principal point for a
             picture of another size.
     """
     try:
-        extrinsics = np.array(viewmat, dtype=np.float64)
-        intrinsics = np.array(K, dtype=np.float64)
-        if extrinsics.shape == (3, 4):
-            extrinsics = np.vstack([extrinsics, [0.0, 0.0, 0.0, 1.0]])
-        camera = Camera(from_numpy(extrinsics), from_numpy(intrinsics), width, height)
+        pose = np.array(viewmat, dtype=np.float64)
+        if pose.shape == (3, 4):
+            pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+        camera = Camera(from_numpy(pose), from_numpy(np.array(K, dtype=np.float64)), *size)
         check_matrices(camera)
     except CalibrationError as error:
         raise CalibrationError(f"Camera {name!r} of {where}: {error}") from None
@@ -117,13 +117,13 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
             f"Camera {name!r} of {where} has a matrix that cannot be read ({reason(error)}); "
             "expected rows of numbers, a 3x3 K and a 4x4 pose."
         ) from None
-    across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height
+    cx, cy = camera.K[:2, 2].tolist()
+    across, down = cx / camera.width, cy / camera.height
     # A wrong picture size moves both ratios the same way; a crop seldom does.
     if not (0 < across < 1 and 0 < down < 1) or max(across, down) < 0.3 or min(across, down) > 0.7:
         raise CalibrationError(
-            f"Camera {name!r} of {where}: the principal point ({intrinsics[0, 2]:.1f}, "
-            f"{intrinsics[1, 2]:.1f}) does not belong to a picture of {width}x{height} pixels; scale the "
-            "intrinsics to the picture's size."
+            f"Camera {name!r} of {where}: the principal point ({cx:.1f}, {cy:.1f}) does not belong to a picture of "
+            f"{camera.width}x{camera.height} pixels; scale the intrinsics to the picture's size."
         )
     return camera
 

@@ -13,7 +13,6 @@ in the folder itself or in one below it: of a name of :data:`ROOTS`, or the only
 name, a link to a file that is not there, or several takes are a ``CaptureError``.
 """
 
-import logging
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from unicodedata import normalize
@@ -25,8 +24,6 @@ from structgstream.errors import CaptureError
 
 REPORT = "report"
 """The folder that the check of a capture leaves in it, whose pictures are no camera's."""
-
-
 SYSTEM = frozenset({"__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN", "System Volume Information", "lost+found"})
 """Folders that file servers, archives and systems leave, with pictures of their own."""
 
@@ -74,8 +71,6 @@ def by_stem(files: Iterable[Path]) -> dict[str, Path]:
         found[name] = file
     return found
 
-
-log = logging.getLogger(__name__)
 
 REDUCED = ("images_2", "images_4", "images_8")
 ROOTS = ("frames", "images", "image", "videos", "hdvideos", "hdimgs", "synchronized_videos", "", *REDUCED)

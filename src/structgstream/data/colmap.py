@@ -9,30 +9,29 @@ that are not known here, are a ``CalibrationError``.
 import logging
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
+from structgstream.data.calibration import Calibration, PosedCamera, intrinsics, rigid
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.data.text_files import Unreadable, number, pixels, read_text, readable, whole
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
+from structgstream.geometry import quaternion_matrices
 
 log = logging.getLogger(__name__)
 
-# Those of a pinhole or with a lens of lenses.py, and how many parameters each has.
-PARAMETERS = {
+MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5,
+    "FULL_OPENCV": 12, "FOV": 0, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 0,
 }  # fmt: skip
-ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-MODEL_NAMES = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
-)  # fmt: skip
+"""COLMAP's camera models in the order of their numbers, and how many parameters each has: 0 where lenses.py has no such
+lens."""
 
 
 def find_model(path: Path) -> Path | None:
@@ -92,16 +91,16 @@ def read_model(folder: Path) -> Calibration:
     return Calibration(folder, ordered, points if len(points) else None, turned_by_exif=False)
 
 
-ColmapCamera = tuple[
-    NDArray[np.float64], tuple[int, int], Lens
-]  # ``K`` ``[3, 3]`` in pixels, the size it is for, the lens
+ColmapCamera = tuple[NDArray[np.float64], tuple[int, int], Lens]
+"""``K`` ``[3, 3]`` in pixels, the size it is for, the lens."""
 
 
-def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
-    params = tuple(map(number, params))
-    if len(params) != _parameters(model, where):
-        raise Unreadable(f"{len(params)} parameters of a {model}")
-    fx, fy, cx, cy, *coefficients = (params[0], *params) if model in ONE_FOCAL_LENGTH else params
+def _camera(model: str, width: int, height: int, params: Sequence[Any], where: Path) -> ColmapCamera:
+    values = tuple(map(number, params))
+    if len(values) != _parameters(model, where):
+        raise Unreadable(f"{len(values)} parameters of a {model}")
+    one_focal_length = "SIMPLE" in model or "RADIAL" in model
+    fx, fy, cx, cy, *coefficients = (values[0], *values) if one_focal_length else values
     lens: Lens = Pinhole()
     if model.endswith("FISHEYE"):
         lens = Fisheye(*coefficients)
@@ -112,29 +111,22 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...], wher
 
 def _parameters(model: str, where: Path) -> int:
     """How many parameters a model has."""
-    if model not in PARAMETERS:
+    if not (count := MODELS.get(model)):
         raise CalibrationError(
             f"{where} has a camera of model {model}, whose lens is not known here; calibrate again with one of "
-            f"{', '.join(PARAMETERS)}, or undistort pictures and model (colmap image_undistorter)."
+            f"{', '.join(filter(MODELS.get, MODELS))}, or undistort pictures and model (colmap image_undistorter)."
         )
-    return PARAMETERS[model]
+    return count
 
 
 def _image(name: str, pose: tuple[float, ...], cameras: dict[int, ColmapCamera], own: int) -> PosedCamera:
     """A picture of camera ``own``, from a quaternion (w, x, y, z) and a translation."""
     if own not in cameras:
         raise Unreadable(f"no camera {own} for a picture")
-    if not 0 < (length := float(np.linalg.norm(pose[:4]))) < np.inf:
+    if not 0 < float(np.linalg.norm(pose[:4])) < np.inf:
         raise Unreadable("a rotation that is no quaternion")
-    w, x, y, z = np.array(pose[:4]) / length
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    viewmat[:3, 3] = pose[4:]
-    return PosedCamera(name, viewmat, *cameras[own])
+    rotation = quaternion_matrices(torch.tensor(pose[:4], dtype=torch.float64)).numpy()
+    return PosedCamera(name, rigid(rotation, pose[4:]), *cameras[own])
 
 
 def _lines(file: Path) -> Iterator[str]:
@@ -144,8 +136,7 @@ def _lines(file: Path) -> Iterator[str]:
 def _text_cameras(file: Path) -> dict[int, ColmapCamera]:
     cameras = {}
     for words in filter(None, map(str.split, _lines(file))):
-        params = tuple(number(word) for word in words[4:])
-        cameras[whole(words[0])] = _camera(words[1], whole(words[2]), whole(words[3]), params, file)
+        cameras[whole(words[0])] = _camera(words[1], whole(words[2]), whole(words[3]), words[4:], file)
     return cameras
 
 
@@ -187,7 +178,7 @@ def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
     offset, cameras = 8, {}
     for _ in range(count):
         own, model, width, height = struct.unpack_from("<iiQQ", data, offset)
-        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"number {model}"
+        name = dict(enumerate(MODELS)).get(model, f"number {model}")
         params = struct.unpack_from(f"<{_parameters(name, file)}d", data, offset + 24)
         cameras[own] = _camera(name, width, height, params, file)
         offset += 24 + 8 * len(params)

@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of published data sets that have a calibration file of their own, by which they are recognised.
+"""Layouts of published data sets that have a calibration file of their own, by which they are recognised
+(docs/captures.md has which cameras they hold out).
 
 What a layout asks for and a capture lacks is a ``CaptureError``, broken numbers are a ``CalibrationError``.
 
 PanopticSports of Dynamic 3D Gaussians (Luiten et al., 3DV 2024): ``train_meta.json`` and ``test_meta.json`` have ``w``,
 ``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV world to camera), ``fn`` (file below ``ims/``) and ``cam_id``.
-The cameras of ``test_meta.json`` are held out.
 
-Google Immersive (Broxton et al., SIGGRAPH 2020): ``models.json`` and a video per camera. Each entry has ``name``,
-``width``, ``height``, ``focal_length``, ``principal_point``, ``radial_distortion`` (OpenCV's fisheye; the first two are
-used, as published loaders do), ``orientation`` (a rotation vector, world to camera) and ``position`` (of the camera in
-the world). The first camera is held out. Published results undistort to pinholes of the same size and principal point
-with half the focal length, and take half of that size (``--scale 0.5``, 1280x960); so does this reader, in one step.
-Pixels outside of the lens's picture are black.
+Google Immersive (Broxton et al., SIGGRAPH 2020): each entry of ``models.json`` has ``name``, ``width``, ``height``,
+``focal_length``, ``principal_point``, ``radial_distortion`` (OpenCV's fisheye; the first two are used, as published
+loaders do), ``orientation`` (a rotation vector, world to camera) and ``position`` (of the camera in the world).
+Published results undistort to pinholes of half the focal length; so does this reader. Pixels outside of the lens's
+picture are black.
 
-Neural 3D Video (Li et al., CVPR 2022) and Meet Room (Li et al., NeurIPS 2022): ``poses_bounds.npy`` and one
-``camXX.mp4`` (Meet Room: ``cam_X.mp4``) per camera, or, decoded for 4DGaussians, ``camXX/images/FRAME.png``. Each row
-is an LLFF pose: a 3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with the axes down, right, backward,
-then two depth bounds. Rows belong to the existing videos in sorted order; the first camera, ``cam00`` or ``cam_0``, is
-held out, as in published results. Published loaders add a COLMAP model, in ``sparse``, ``colmap/sparse`` or
-``colmap_0/sparse``: its points are used, transformed to the poses of the file.
+Neural 3D Video (Li et al., CVPR 2022) and Meet Room (Li et al., NeurIPS 2022): each row of ``poses_bounds.npy`` is an
+LLFF pose: a 3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with the axes down, right, backward, then
+two depth bounds. Rows belong to the existing videos in sorted order. The points of a COLMAP model are transformed to
+these poses.
 
-``cameras.json`` and a video per camera, in OpenCV axes, in two dialects. The package's own, as of the bundled clip:
-``{"width", "height", "fps", "frames", "near", "held_out": [names], "cameras": {name: {"K": 3x3, "viewmat": 4x4 world to
-camera}}}`` with ``name.mp4``. Of shared intrinsics: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4 camera to
-world, ...]}`` with ``cam00.mp4``, ``cam01.mp4``, ... in the order of ``cams``; camera 0 is held out.
+``cameras.json``, in OpenCV axes, has two dialects. The package's own, as of the bundled clip: ``{"width", "height",
+"fps", "frames", "near", "held_out": [names], "cameras": {name: {"K": 3x3, "viewmat": 4x4 world to camera}}}`` with
+``name.mp4``. Of shared intrinsics: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4 camera to world, ...]}`` with
+``cam00.mp4``, ``cam01.mp4``, ... in the order of ``cams``.
 
 Note [Order of rows]
 ~~~~~~~~~~~~~~~~~~~~
@@ -34,6 +31,7 @@ two differ the pictures decide: the order in which more pairs of neighbours agre
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
@@ -101,9 +99,8 @@ def open_panoptic(path: Path) -> ImageSource:
         files |= pictures
         if meta.name == TEST:
             held_out += found
-    names = sorted(cameras, key=natural)
-    rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
-    common, instants = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
+    rig = calibrated_rig({name: cameras[name] for name in sorted(cameras, key=natural)}, held_out, where=path)
+    common, instants = common_pictures({name: files[name] for name in rig}, where=path, training=rig.training)
     return ImageSource(path.name, rig, PANOPTIC_FPS, common, instants=instants)
 
 
@@ -111,32 +108,27 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
     """Cameras of one file, and those pictures of each that exist, by the name of the instant."""
     with readable(meta, "w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras"):
         content = mapping(read_json(meta))
-        width, height = pixels((content["w"], content["h"]))
+        size = pixels((content["w"], content["h"]))
         pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
-        rows = [
-            # The path below ``ims`` may name that and what is above it.
-            (
-                str(name),
-                K,
-                viewmat,
-                pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:])),
-                file,
-            )
-            for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
-            for name, K, viewmat, file in zip(*frame, strict=True)
-        ]
+        rows = []
+        for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True):
+            for name, K, viewmat, file in zip(*frame, strict=True):
+                # The path below ``ims`` may name that and what is above it.
+                picture = pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:]))
+                rows.append((str(name), (K, viewmat), file, picture))
     first: dict[str, tuple[Any, Any]] = {}
-    files: dict[str, dict[str, Path]] = {name: {} for name, *_ in rows}
-    for name, K, viewmat, picture, file in rows:
-        known = first.setdefault(name, (K, viewmat))
-        if known != (K, viewmat) and not _same(known, (K, viewmat)):
+    files: dict[str, dict[str, Path]] = {}
+    for name, matrices, file, picture in rows:
+        known = first.setdefault(name, matrices)
+        if known != matrices and not _same(known, matrices):
             raise CalibrationError(
                 f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
             )
+        own = files.setdefault(name, {})
         if picture is not None:
-            files[name][picture.stem] = picture
+            own[picture.stem] = picture
     cameras = {
-        name: calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=meta)
+        name: calibrated_camera(name, viewmat=viewmat, K=K, size=size, where=meta)
         for name, (K, viewmat) in first.items()
     }
     return cameras, files
@@ -144,13 +136,10 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
 
 def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
     """Whether two pairs of matrices agree up to rounding; NaN agrees with NaN, which the camera refuses."""
-    try:
-        return all(
-            np.allclose(np.array(x, float), np.array(y, float), rtol=1e-6, atol=1e-9, equal_nan=True)
-            for x, y in zip(a, b)
-        )
-    except (TypeError, ValueError):
-        return False
+    with suppress(TypeError, ValueError):
+        pairs = [(np.array(x, float), np.array(y, float)) for x, y in zip(a, b)]
+        return all(np.allclose(x, y, rtol=1e-6, atol=1e-9, equal_nan=True) for x, y in pairs)
+    return False
 
 
 MODELS_FILE = "models.json"
@@ -223,28 +212,26 @@ def open_n3dv(path: Path) -> FrameSource:
         return of_pictures(path, pictures, posed, root=path, calibration=calibration)[0]
 
     source = opened(names)
-    if names != sorted(names) and _as_text(source, opened(sorted(names)).rig):
-        log.info(
-            "%s: its rows are in the order of the names as text (cam1, cam10, cam2), as the pictures say", path / POSES
-        )
-        source = opened(sorted(names))
+    if names != sorted(names) and _as_text(source, as_text := opened(sorted(names))):
+        text = "%s: its rows are in the order of the names as text (cam1, cam10, cam2), as the pictures say"
+        log.info(text, path / POSES)
+        source = as_text
     model = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
     points = None if model is None else aligned_points(read_model(model), source.rig)
     return replace(source, points=points)  # type: ignore[type-var]
 
 
-def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
+def _as_text(by_number: FrameSource, as_text: FrameSource) -> bool:
     """Whether the pictures of frame 0 agree with the second rig rather than the first; see Note [Order of rows]."""
-    training = {name: by_number.rig[name] for name in by_number.rig.training}
-    width = max(camera.width for camera in training.values())
-    small = resized(by_number, min(1.0, SIDE / width))
-    frame = next(iter(small.frames()))
-    names = list(frame.showing(small.rig.training))
+    rig = by_number.rig
+    scale = min(1.0, SIDE / max(rig[name].width for name in rig.training))
+    frame = next(iter(resized(by_number, scale).frames()))
+    names = list(frame.showing(rig.training))
     matcher = PairMatcher({name: frame.images[name] for name in names})
-    shares = []
-    for rig in (by_number.rig, as_text):
-        cameras = {name: rig[name].resized(small.rig[name].width, small.rig[name].height) for name in names}
-        shares.append(confirmed_share(cameras, matcher))
+    shares = [
+        confirmed_share({name: source.rig[name].scaled(scale) for name in names}, matcher)
+        for source in (by_number, as_text)
+    ]
     if max(shares) < MIN_CONFIRMED or shares[0] == shares[1]:
         log.warning(
             "%s: the pictures do not say whether the rows of %s follow the names by number or as text; by "
@@ -306,9 +293,9 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
 
 
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
-    width, height = pixels((content["width"], content["height"]))
+    size = pixels((content["width"], content["height"]))
     cameras = {
-        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], size=size, where=file)
         for name, entry in mapping(content["cameras"]).items()
     }
     near = positive(content, "near") if "near" in content else None
@@ -318,13 +305,13 @@ def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
 
 def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
     K = [[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]]
-    width, height = pixels((content["w"], content["h"]))
+    size = pixels((content["w"], content["h"]))
     cameras: dict[str, Camera] = {}
     for index, pose in enumerate(content["cams"]):
         name = f"cam{index:02d}"
         with readable(f"Camera {name!r} of {file}", "a pose of 4x4 numbers that can be inverted"):
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
-        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
+        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, size=size, where=file)
     return calibrated_rig(cameras, ("cam00",), where=file)
 
 
@@ -360,13 +347,11 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     found: dict[str, PosedCamera] = {}  # whose camera's name is a part of a picture's
     for posed in model.cameras:
         parts = PurePosixPath(posed.name).with_suffix("").parts
-        if (name := next((part for part in parts if part in rig.cameras), None)) is not None:
+        if name := next((part for part in parts if part in rig.cameras), None):
             found.setdefault(name, posed)
     if len(found) < MIN_COMMON:
-        log.warning(
-            "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names.",
-            model.where, len(found),
-        )  # fmt: skip
+        text = "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names."
+        log.warning(text, model.where, len(found))
         return None
     fitted = alignment(
         {name: posed.viewmat for name, posed in found.items()}, {name: rig[name].viewmat.numpy() for name in found}
@@ -375,9 +360,7 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     ours = np.array([rig[name].center.numpy() for name in found])
     off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
     if not off <= MAX_OFF:
-        log.warning(
-            "The cameras of %s lie up to %.0f %% of their extent away from the rig's; its points are not used.",
-            model.where, 100 * off,
-        )  # fmt: skip
+        text = "The cameras of %s lie up to %.0f %% of their extent away from the rig's; its points are not used."
+        log.warning(text, model.where, 100 * off)
         return None
     return fitted.points(model.points)

@@ -12,12 +12,12 @@ import re
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from itertools import repeat
+from itertools import islice, repeat
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,12 +25,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.data.timeline import common_slots, instants_of, natural
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError, import_extra
 from structgstream.frames import MultiViewFrame
 
 if TYPE_CHECKING:
+    from PIL.ImageCms import ImageCmsTransform
     from PIL.ImageFile import ImageFile
 
 PICTURE_SUFFIXES = frozenset({
@@ -80,17 +81,23 @@ class ImageSource:
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
-                found = pool.map(
-                    _picture,
-                    paths.values(),
-                    [self.rig[name] for name in paths],
-                    repeat(bits),
-                    [self.turns.get(name, 1) for name in paths],
-                )
-                pictures = dict(zip(paths, found, strict=True))
+                pictures = dict(zip(paths, pool.map(self._read, paths, paths.values(), repeat(bits)), strict=True))
                 masks = {name: mask for name, (_, mask) in pictures.items() if mask is not None}
                 images = {name: picture for name, (picture, _) in pictures.items()}
                 yield MultiViewFrame(index, index / self.fps, images, masks=masks)
+
+    def _read(self, name: str, path: Path, bits: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """A picture of a camera and where it is opaque, turned, checked against the size of the camera."""
+        picture, mask = read_picture_and_mask(path, bits=bits)
+        turn, camera = self.turns.get(name, 1), self.rig[name]
+        picture, mask = turned(picture, turn), None if mask is None else turned(mask, turn)
+        height, width = picture.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise CalibrationError(
+                f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
+                f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
+            )
+        return picture, mask
 
 
 def opencv() -> ModuleType:
@@ -126,9 +133,11 @@ def common_pictures(
         camera: {named[keys[camera][instant]]: file for instant, file in pictures.items()}
         for camera, pictures in files.items()
     }
-    instants = sorted({instant for pictures in files.values() for instant in pictures}, key=natural)
-    slot_of = {instant: slot for slot, instant in enumerate(instants)}
-    slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
+    instants = sorted({*named.values()}, key=natural)
+    slots = {
+        camera: [slot for slot, instant in enumerate(instants) if instant in pictures]
+        for camera, pictures in files.items()
+    }
     common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}", training=training)
     shown = tuple(instants[slot] for slot in common)
     return {camera: tuple(map(pictures.get, shown)) for camera, pictures in files.items()}, shown
@@ -171,14 +180,15 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
 
 def _in_srgb(picture: NDArray[np.uint8], profile: bytes | None) -> NDArray[np.uint8]:
     """A picture ``[H, W, 3]`` whose values are colours of an ICC profile (Display P3, Adobe RGB), in sRGB."""
-    convert = _to_srgb(profile) if profile else None
-    return picture if convert is None else convert(picture)
+    from PIL import Image, ImageCms
+
+    transform = _to_srgb(profile) if profile else None
+    return picture if transform is None else np.array(ImageCms.applyTransform(Image.fromarray(picture), transform))
 
 
 @cache
-def _to_srgb(profile: bytes) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
-    """Converts pictures ``[H, W, 3]`` of an ICC profile; None for sRGB, in its many spellings, and for profiles that
-    are damaged or not of RGB."""
+def _to_srgb(profile: bytes) -> "ImageCmsTransform | None":
+    """From an ICC profile; None for sRGB, in its many spellings, and for profiles that are damaged or not of RGB."""
     from PIL import Image, ImageCms
 
     if profile[16:20] != b"RGB ":
@@ -188,14 +198,10 @@ def _to_srgb(profile: bytes) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
         transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
     except (ImageCms.PyCMSError, OSError):
         return None
-
-    def convert(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return np.array(ImageCms.applyTransform(Image.fromarray(picture), transform))
-
     levels = np.arange(0, 256, 15).astype(np.uint8)
     cube = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(len(levels), -1, 3)
-    change = np.abs(convert(cube).astype(np.int16) - cube)
-    return convert if change.max() > SAME_COLORS else None
+    change = np.abs(np.array(ImageCms.applyTransform(Image.fromarray(cube), transform)).astype(np.int16) - cube)
+    return transform if change.max() > SAME_COLORS else None
 
 
 def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
@@ -204,32 +210,33 @@ def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
     Machine vision cameras store 10 to 14 bits in 16. The first, middle and last picture of each camera decide, so that
     it does not depend on where reading starts.
     """
-    most = 0
+    most, first = 0, None
     for own in files.values():
         present = [file for file in own if file is not None]
+        first = first or next(iter(present), None)
         for file in dict.fromkeys((present[0], present[len(present) // 2], present[-1]) if present else ()):
-            if not _may_be_deep(file):
-                break
-            stored = stored_picture(file)
-            if stored.dtype != np.uint16:
+            if not _may_be_deep(file) or (stored := stored_picture(file)).dtype != np.uint16:
                 break
             most = max(most, int((stored[..., :3] if stored.ndim == 3 else stored).max()))
     bits = next(bits for bits in (10, 12, 14, 16) if not most >> bits) if most else 16
     if bits < 16:
-        log.warning(
-            "The pictures of 16 bits, such as %s, have values up to %d: they are read as %d bits",
-            next(file for own in files.values() for file in own if file is not None), most, bits,
-        )  # fmt: skip
+        text = "The pictures of 16 bits, such as %s, have values up to %d: they are read as %d bits"
+        log.warning(text, first, most, bits)
     return bits
+
+
+def read_bytes(path: Path, *, what: str = "picture", count: int = -1) -> bytes:
+    """The content of a file, or its first ``count`` bytes. Raises CaptureError, which names ``what`` it is."""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError as error:
+        raise CaptureError(f"The {what} {path} cannot be read ({error.strerror}); restore it.") from None
 
 
 def _may_be_deep(path: Path) -> bool:
     """Whether a file may hold more than 8 bits, by its header."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(25)
-    except OSError as error:
-        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+    head = read_bytes(path, count=25)
     if head[:8] == b"\x89PNG\r\n\x1a\n":
         return head[24:25] == b"\x10"
     return head[:2] in (b"II", b"MM", b"P5", b"P6", b"\xff\x4f") or head[4:8] == b"jP  "
@@ -237,11 +244,7 @@ def _may_be_deep(path: Path) -> bool:
 
 def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """The values of a file, ``[H, W]``, or ``[H, W, 3 or 4]`` in OpenCV's order of colours."""
-    cv2 = opencv()
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+    cv2, data = opencv(), read_bytes(path)
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
         return _heif_picture(path, data)
     if not data or is_cut_jpeg(data):
@@ -255,13 +258,13 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         picture = None
-    if picture is not None and picture.dtype not in (np.uint8, np.uint16):
+    if picture is None:
+        raise _undecodable(path, data)
+    if picture.dtype not in (np.uint8, np.uint16):
         raise CaptureError(
             f"The picture {path} has values that are no whole numbers of 8 or 16 bits; expected sRGB of 8 or 16 bits: "
             "convert it, with the transfer function of sRGB if its values are linear."
         )
-    if picture is None:
-        raise _undecodable(path, data)
     return picture
 
 
@@ -344,19 +347,6 @@ def _heif_picture(path: Path, data: bytes) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
-def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """One picture and where it is opaque, checked against the size of its camera."""
-    picture, mask = read_picture_and_mask(path, bits=bits)
-    picture, mask = turned(picture, turn), None if mask is None else turned(mask, turn)
-    height, width = picture.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise CalibrationError(
-            f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
-            f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
-        )
-    return picture, mask
-
-
 def turned(picture: NDArray[Pixel], orientation: int) -> NDArray[Pixel]:
     """A picture ``[H, W, ...]`` as it is shown by its EXIF orientation, 1 to 8."""
     if orientation >= 5:
@@ -371,9 +361,8 @@ def reduced_picture(picture: NDArray[np.uint8], longest_side: int) -> NDArray[np
     factor = longest_side / max(width, height)
     if factor >= 1:
         return picture
-    cv2 = opencv()
     size = (max(round(width * factor), 1), max(round(height * factor), 1))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(opencv().resize(picture, size, interpolation=opencv().INTER_AREA), np.uint8)
 
 
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -413,8 +402,7 @@ def check_one_series(camera: str, files: Iterable[Path]) -> None:
                 f"{file.name} have the same number; expected one: move the other one out of the folder (masks to "
                 "masks/CAMERA)."
             )
-    series = [*firsts.values()][:MAX_SERIES] if len(firsts) > 1 else []
-    sizes = {picture_size(file): file for file in series}
+    sizes = {picture_size(file): file for file in islice(firsts.values(), MAX_SERIES)} if len(firsts) > 1 else {}
     if len(sizes) > 1:
         (one, first), (other, second) = [*sizes.items()][:2]
         raise CaptureError(
@@ -490,32 +478,28 @@ def read_exif(path: Path) -> StatedOptics:
 
 
 def _focal_pixels(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    equivalent, plane = _number(tags.get(FOCAL_35MM)), _by_plane(tags, size)
-    film = None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
-    likely = [
-        focal for focal in (plane, film) if focal is not None and MIN_FOCAL_SHARE < focal / max(size) < MAX_FOCAL_SHARE
-    ]
+    film = _number(tags.get(FOCAL_35MM)) * math.hypot(*size) / DIAGONAL_35MM
+    found = (_by_plane(tags, size), film)
+    likely = [focal for focal in found if MIN_FOCAL_SHARE < focal / max(size) < MAX_FOCAL_SHARE]
     if len(likely) == 2 and abs(likely[0] / likely[1] - 1) > AGREE:
         return film
     return likely[0] if likely else None
 
 
-def _by_plane(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    """By the resolution of the sensor for the picture as it was taken, which may have been reduced since."""
-    length, resolution = _number(tags.get(FOCAL_LENGTH)), _number(tags.get(PLANE_RESOLUTION))
-    unit = MILLIMETRES.get(tags.get(PLANE_UNIT, 2))
-    if length is None or resolution is None or unit is None:
-        return None
+def _by_plane(tags: Mapping[int, Any], size: tuple[int, int]) -> float:
+    """By the resolution of the sensor for the picture as it was taken, which may have been reduced since; or NaN."""
+    unit = MILLIMETRES.get(tags.get(PLANE_UNIT, 2), math.nan)
+    focal = _number(tags.get(FOCAL_LENGTH)) * _number(tags.get(PLANE_RESOLUTION)) / unit
     across, down = _number(tags.get(PIXELS_ACROSS)), _number(tags.get(PIXELS_DOWN))
-    if across is not None and down is not None:  # The longer sides: what turns a picture seldom turns its tags.
-        return length * resolution / unit * max(size) / max(across, down)
-    return length * resolution / unit * size[0] / (across or size[0])
+    if math.isfinite(across + down):  # The longer sides: what turns a picture seldom turns its tags.
+        return focal * max(size) / max(across, down)
+    return focal * size[0] / (size[0] if math.isnan(across) else across)
 
 
-def _number(value: object) -> float | None:
-    """A positive number; None for anything else, as tags of 0 and 0/0 that mean unknown."""
+def _number(value: object) -> float:
+    """A positive number; NaN for anything else, as tags of 0 and 0/0 that mean unknown."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if 0 < number < math.inf else None
+        return math.nan
+    return number if 0 < number < math.inf else math.nan

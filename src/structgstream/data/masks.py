@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
 from structgstream.data.camera_files import by_stem, is_hidden, name_of
-from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, read_bytes, reduced_mask
 from structgstream.data.source import FrameSource, SourceWrapper, innermost, resized_to
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import UndistortedSource, lenses_of
@@ -56,7 +56,6 @@ class MaskedSource(SourceWrapper):
     _always: dict[str, Mask | None] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        """The frames from stream index ``start``."""
         with ThreadPoolExecutor(min(len(self.files), os.cpu_count() or 1) or 1, "masks") as pool:
             for frame in self.source.frames(start):
                 names = [name for name in frame.images if name in self.files]
@@ -78,9 +77,7 @@ class MaskedSource(SourceWrapper):
         if name not in self._always:
             self._always[name] = None if files.always is None else self._read(files.always, name)
         always, file = self._always[name], files.frames.get(index)
-        if file is None:
-            return always
-        own = self._read(file, name)
+        own = None if file is None else self._read(file, name)
         return own if always is None else always if own is None else always & own
 
     def _read(self, file: Path, name: str) -> Mask | None:
@@ -91,11 +88,7 @@ class MaskedSource(SourceWrapper):
 
 def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is neither black nor transparent."""
-    cv2 = opencv()
-    try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError as error:
-        raise CaptureError(f"The mask {file} cannot be read ({error.strerror}); restore it.") from None
+    cv2, data = opencv(), np.frombuffer(read_bytes(file, what="mask"), np.uint8)
     # As stored: a conversion to 8 bits would make small numbers of 16, and all that alpha hides, count otherwise.
     picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if picture is None:
@@ -131,12 +124,11 @@ def with_masks(source: FrameSource, folder: Path, *, without: Collection[str] = 
         return source
     names = {name_of(entry): entry for entry in entries}
     folders = {name_of(entry): entry for entry in entries if entry.is_dir()}
-    for name, entry in names.items():
-        if name not in source.rig.cameras:
-            raise CaptureError(
-                f"{entry} is a mask of camera {name!r}, which the capture {source.name} does not have; its cameras are "
-                f"{', '.join(source.rig)}. Rename or remove it."
-            )
+    if unknown := next((name for name in names if name not in source.rig.cameras), None):
+        raise CaptureError(
+            f"{names[unknown]} is a mask of camera {unknown!r}, which the capture {source.name} does not have; its "
+            f"cameras are {', '.join(source.rig)}. Rename or remove it."
+        )
 
     def masked(stored: FrameSource) -> FrameSource:
         files = {name: _files(folder, name, stored, folders.get(name)) for name in stored.rig if name in names}
@@ -177,26 +169,23 @@ def _files(folder: Path, name: str, source: FrameSource, own: Path | None) -> Ca
     always, files = lasting_mask(folder, name), {} if own is None else by_stem(_masks(own))
     entries = [] if own is None else [entry for entry in sorted(own.iterdir()) if not is_hidden(entry)]
     numbers = _frame_numbers(source, name) if entries else {}
-    is_named = isinstance(innermost(source), ImageSource)  # frames of videos have no names
-    if not is_named:
+    expected = f"{next(iter(numbers), '000000')}.png"
+    if not isinstance(innermost(source), ImageSource):  # frames of videos have no names
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
+        expected = "000000.png, the frame's number in the video, from 0"
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
     others = [file for stem, file in files.items() if stem not in numbers]
     if frames and others:
         log.warning("%d masks in %s are of no frame of the capture, such as %s", len(others), own, others[0].name)
     if entries and not frames:
-        expected = "000000.png, the frame's number in the video, from 0"
-        if is_named:
-            expected = f"{next(iter(numbers), '000000')}.png"
         raise CaptureError(
             f"None of the masks in {own} is of a frame of the capture, such as {entries[0].name}; "
             f"expected names such as {expected}."
         )
     size = (source.rig[name].width, source.rig[name].height)
-    masks = CameraMasks(size, always, frames)
-    for file in filter(None, (masks.always, next(iter(frames.values()), None))):
+    for file in filter(None, (always, next(iter(frames.values()), None))):
         read_mask(file, size=size, camera=name)
-    return masks
+    return CameraMasks(size, always, frames)
 
 
 def _frame_numbers(source: FrameSource, name: str) -> dict[str, int]:

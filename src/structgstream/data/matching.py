@@ -21,7 +21,7 @@ from structgstream.geometry import Floats, Indices, cross_matrices
 Pair = tuple[str, str]
 """Names of two cameras."""
 
-_DEPTH_SHARES = (0.5, 0.7, 1.0, 1.4, 2.0)
+_DEPTH_SHARES = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
 _GRID = (np.arange(6) + 0.5) / 6
 _BEST_ANGLES_DEGREES = (7.0, 20.0)
 
@@ -54,14 +54,7 @@ def sift_features(
         image = reduced_picture(image, longest_side)
         mask = None if mask is None else reduced_mask(mask, image.shape[1::-1])
     # Without the precise upscale every keypoint would be off by a quarter of a pixel.
-    sift = cv2.SIFT.create(
-        nfeatures=count,
-        nOctaveLayers=3,
-        contrastThreshold=contrast,
-        edgeThreshold=12.0,
-        sigma=1.6,
-        enable_precise_upscale=True,
-    )
+    sift = cv2.SIFT.create(count, contrastThreshold=contrast, edgeThreshold=12.0, enable_precise_upscale=True)
     within = np.empty(0) if mask is None else mask.astype(np.uint8)
     keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), within)
     if descriptors is None or len(keypoints) == 0:
@@ -132,12 +125,8 @@ def neighbor_views(cameras: Mapping[str, Camera], *, count: int, distance: float
     low, high = _BEST_ANGLES_DEGREES
     chosen: dict[str, tuple[str, ...]] = {}
     for name, camera in cameras.items():
-        u, v, depths = (
-            axis.ravel()
-            for axis in np.meshgrid(
-                _GRID * camera.width, _GRID * camera.height, np.array(_DEPTH_SHARES) * distance, indexing="ij"
-            )
-        )
+        axes = np.meshgrid(_GRID * camera.width, _GRID * camera.height, _DEPTH_SHARES * distance, indexing="ij")
+        u, v, depths = map(np.ravel, axes)
         points = back_project(camera, np.stack([u, v], 1), depths)
         scores: dict[str, float] = {}
         for other_name, other in cameras.items():
@@ -199,8 +188,7 @@ def triangulate(first: Camera, second: Camera, pixels1: Floats, pixels2: Floats)
     base = second.center.numpy() - first.center.numpy()
     a, b, c = (rays1 * rays1).sum(1), (rays1 * rays2).sum(1), (rays2 * rays2).sum(1)
     d, e = rays1 @ base, rays2 @ base
-    # Parallel rays meet at infinity; the floor on the determinant sends them there, not into a division by
-    # zero.
+    # Parallel rays meet at infinity; the floor on the determinant avoids a division by zero.
     determinant = np.maximum(a * c - b * b, 1e-12 * a * c)
     along1, along2 = (c * d - b * e) / determinant, (b * d - a * e) / determinant
     points1 = first.center.numpy() + rays1 * along1[:, None]
@@ -235,13 +223,7 @@ def guided_matches(
 
 
 def mutually_best(
-    first: Features,
-    second: Features,
-    row: Indices,
-    column: Indices,
-    *,
-    ratio: float,
-    distance: float = np.inf,
+    first: Features, second: Features, row: Indices, column: Indices, *, ratio: float, distance: float = np.inf
 ) -> Indices:
     """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
 
@@ -273,13 +255,11 @@ def distinct_best(
         cost: ``[C]``, descriptor distance.
     """
     order = np.lexsort((cost, query))
-    query_sorted = query[order]
-    starts = np.flatnonzero(np.diff(query_sorted, prepend=-1))
-    best = order[starts]
-    group = np.cumsum(np.diff(query_sorted, prepend=-1) != 0) - 1
+    is_first = np.diff(query[order], prepend=-1) != 0
+    best, group = order[is_first], np.cumsum(is_first) - 1
     distances = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1)
     rival = distances > DISTINCT_PIXELS
-    rival_cost = np.full(len(starts), np.inf)
+    rival_cost = np.full(len(best), np.inf)
     np.minimum.at(rival_cost, group[rival], cost[order][rival])
     return best[cost[best] < ratio * rival_cost]
 
@@ -406,13 +386,13 @@ class PairMatcher:
         """As :meth:`matches`, numbers ``[S, 2]`` of keypoints."""
         names = sorted({name for pair in pairs for name in pair} - set(self._features))
         missing = [pair for pair in pairs if pair not in self._found]
-        with ThreadPoolExecutor(max(1, min(len(names) + 1, os.cpu_count() or 1))) as pool:
+        with ThreadPoolExecutor(min(len(names) + 1, os.cpu_count() or 1)) as pool:
             self._features |= zip(names, pool.map(self._extract, names), strict=True)
             self._found |= zip(missing, pool.map(self._match, missing), strict=True)
         return {pair: self._found[pair] for pair in pairs}
 
     def keypoints(self, name: str) -> Floats:
-        """Pixels ``[S, 2]`` of the keypoints of a picture that was matched."""
+        """Pixels ``[S, 2]`` of the keypoints of a matched picture."""
         return self._features[name].pixels
 
     def _extract(self, name: str) -> Features:
@@ -422,8 +402,6 @@ class PairMatcher:
     def _match(self, pair: Pair) -> Indices:
         empty = np.empty((0, 2), np.intp)
         first, second = (self._features[name] for name in pair)
-        if min(len(first.pixels), len(second.pixels)) < MIN_INLIERS:
-            return empty
         rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=RATIO).T
         if len(rows) < MIN_INLIERS:
             return empty

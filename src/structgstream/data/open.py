@@ -5,19 +5,6 @@ A calibration is COLMAP's, transforms.json or a file of another tool, in the fol
 the videos. Pose2Sim has ``calibration/Calib.toml`` next to ``videos/``, caliscope ``camera_array.toml`` above
 ``recordings/TAKE/``, 3DGStream the model of COLMAP in the folder of the first frame. One that is broken or refused, or
 several that differ, are a ``CalibrationError``.
-
-Note [Surrounded]
-~~~~~~~~~~~~~~~~~
-A held-out camera measures interpolation if others stand on all of its sides, and extrapolation at the rim of the rig.
-The measure is the camera's Voronoi cell among the others, in the plane of its picture: the cell is bounded exactly if
-the camera lies inside the convex hull of the others, and small if they stand near on all sides (Aurenhammer, ACM
-Computing Surveys, 1991). With others at angles ``a`` and distances ``d``, the border of the cell in the direction ``u``
-is at half of ``reach(u)``, the least ``d / cos(a - u)``. Three departures make it a measure of rigs:
-
-- Of two opposite directions the farther reach counts for both, so that a twin on one side makes no camera surrounded.
-- ``d`` is divided by the cosine of half the angle between both view directions: a camera that looks elsewhere surrounds
-  nothing.
-- A cell ends at the extent of the rig. In a row of cameras all cells are open upwards and downwards.
 """
 
 import logging
@@ -46,6 +33,7 @@ from structgstream.data.camera_files import (
     unread_files,
     videos_in,
 )
+from structgstream.data.camera_spacing import best_surrounded
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.dataset_layouts import (
     CAMERAS_FILE,
@@ -64,7 +52,6 @@ from structgstream.data.prepared import open_prepared, read_prepared, recognizes
 from structgstream.data.roving import with_roving
 from structgstream.data.source import FrameSource, WithoutPoints, WithRig, resized, section
 from structgstream.errors import CalibrationError, CaptureError, ConfigError, StructGStreamError
-from structgstream.geometry import Floats
 
 log = logging.getLogger(__name__)
 
@@ -89,31 +76,6 @@ CALIBRATION_FORMATS = (
 What reads pictures with OpenCV turns them as their EXIF orientation states."""
 
 
-def recognizes_calibrated(path: Path) -> bool:
-    """Whether the folder has a calibration file of another tool that is known here, or one that is refused."""
-    return any(True for own in CALIBRATION_FORMATS for _ in own.find(path)) or bool(_pickles(path))
-
-
-def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
-    """The cameras of the other tools' calibration file in the folder ``path``; None when there is none."""
-    found = [(own, files) for own in CALIBRATION_FORMATS for files in own.find(path)]
-    read = [own.read(files) for own, files in found if file is None or file in files]
-    if different := [other for other in read[1:] if not _agree(read[0], other)]:
-        raise CalibrationError(
-            f"{path} has several calibrations that differ, {read[0].where.name} and "
-            f"{', '.join(other.where.name for other in different[:3])}; expected that of this take alone: move the "
-            "others out of the folder (prepare takes one by --calibration FILE)."
-        )
-    if read:
-        return read[0]
-    if pickles := [pickle for pickle in _pickles(path) if file in (None, pickle)]:
-        raise CalibrationError(
-            f"{pickles[0]} is a pickle, and opening it could run any program; it is refused. "
-            "Convert it, with a program that you trust, to one of the formats of docs/captures.md."
-        )
-    return None
-
-
 def read_calibration(folder: Path, file: Path | None = None) -> Calibration | None:
     """The calibration in a folder, of COLMAP, transforms.json or another tool, in this order; None without any."""
     model, files = find_model(folder), transforms.find(folder)
@@ -121,12 +83,28 @@ def read_calibration(folder: Path, file: Path | None = None) -> Calibration | No
         return read_model(model)
     if files and (file is None or file in files):
         return transforms.read(files)
-    return read_calibrated(folder, file)
+    found = [(own, files) for own in CALIBRATION_FORMATS for files in own.find(folder)]
+    read = [own.read(files) for own, files in found if file is None or file in files]
+    if different := [other for other in read[1:] if not _agree(read[0], other)]:
+        raise CalibrationError(
+            f"{folder} has several calibrations that differ, {read[0].where.name} and "
+            f"{', '.join(other.where.name for other in different[:3])}; expected that of this take alone: move the "
+            "others out of the folder (prepare takes one by --calibration FILE)."
+        )
+    if read:
+        return read[0]
+    if pickles := [pickle for pickle in _pickles(folder) if file in (None, pickle)]:
+        raise CalibrationError(
+            f"{pickles[0]} is a pickle, and opening it could run any program; it is refused. "
+            "Convert it, with a program that you trust, to one of the formats of docs/captures.md."
+        )
+    return None
 
 
 def has_calibration(folder: Path) -> bool:
     """Whether :func:`read_calibration` finds or refuses one."""
-    return find_model(folder) is not None or bool(transforms.find(folder)) or recognizes_calibrated(folder)
+    known = find_model(folder) or transforms.find(folder) or any(any(own.find(folder)) for own in CALIBRATION_FORMATS)
+    return bool(known or _pickles(folder))
 
 
 def calibration_below(path: Path) -> Path | None:
@@ -135,10 +113,9 @@ def calibration_below(path: Path) -> Path | None:
     It may lie one deeper, as EasyVolcap's ``optimized/cameras``.
     """
     inner = inner_folders(path)
-    found = [folder for folder in inner if has_calibration(folder) and not _is_capture(folder)]
+    found = list(filter(_is_calibration, inner))
     if not found and has_frames(path):
-        deeper = [own for folder in inner if not has_files(folder) for own in folders_of(folder)]
-        found = [folder for folder in deeper if has_calibration(folder) and not _is_capture(folder)]
+        found = [own for folder in inner if not has_files(folder) for own in folders_of(folder) if _is_calibration(own)]
     frames = pictures_in(path)
     if found and all(folder.name in frames for folder in found):
         return found[0]  # of the first frame, as 3DGStream has it
@@ -155,17 +132,19 @@ def inner_folders(path: Path) -> list[Path]:
     return folders_of(path, without={*NO_CAMERAS, "sparse", "sparse_"} - {"calibration"})
 
 
-def _is_capture(folder: Path) -> bool:
-    """Whether a folder with a calibration holds frames, and not what the calibration was made from."""
-    if "calib" in folder.name.lower():
+def _is_calibration(folder: Path) -> bool:
+    """Whether a folder holds a calibration, and no frames but what it was made from."""
+    if not has_calibration(folder):
         return False
-    roots = roots_of(folder)
-    stills = [root for root in roots if root == folder or root.name.lower() == "images"]
-    if any(len(videos_in(root)) > 1 or len(pictures_in(root)) > 1 for root in roots):
+    if "calib" in folder.name.lower():
         return True
+    roots = roots_of(folder)
+    if any(len(videos_in(root)) > 1 or len(pictures_in(root)) > 1 for root in roots):
+        return False
     siblings = pictures_in(folder.parent)
     is_frame = folder.name in siblings and len(siblings) > 1
-    return not is_frame and any(files_of(root, PICTURE_SUFFIXES) for root in stills)
+    stills = [root for root in roots if root == folder or root.name.lower() == "images"]
+    return is_frame or not any(files_of(root, PICTURE_SUFFIXES) for root in stills)
 
 
 def _pickles(path: Path) -> list[Path]:
@@ -216,16 +195,16 @@ def open_calibrated(path: Path) -> FrameSource:
     return open_posed(path, calibration)
 
 
-CAPTURE_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...] = (
+CAPTURE_LAYOUTS: tuple[tuple[Callable[[Path], object], Callable[[Path], FrameSource]], ...] = (
     (recognizes_prepared, open_prepared),
     (lambda path: (path / TRAIN).is_file(), open_panoptic),
     (lambda path: (path / CAMERAS_FILE).is_file(), open_json_videos),
     (lambda path: (path / POSES).is_file(), open_n3dv),
     (lambda path: (path / MODELS_FILE).is_file(), open_immersive),
-    (lambda path: find_model(path) is not None, open_calibrated),
-    (lambda path: bool(transforms.find(path)), transforms.open_transforms),
-    (recognizes_calibrated, open_calibrated),
-    (lambda path: calibration_below(path) is not None, open_calibrated),
+    (find_model, open_calibrated),
+    (transforms.find, transforms.open_transforms),
+    (has_calibration, open_calibrated),
+    (calibration_below, open_calibrated),
 )
 """Whether a folder has a layout, and what opens it. The first that recognises the folder opens it.
 
@@ -252,7 +231,7 @@ def open_capture(
     Args:
         path: the folder.
         held_out: names of the cameras to keep from training; None for those that the layout holds out; "auto" for the
-            one best surrounded by others (:func:`~structgstream.data.open.best_surrounded`).
+            one best surrounded by others (:func:`~structgstream.data.camera_spacing.best_surrounded`).
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
         frames: number of frames to use, None for all.
@@ -363,15 +342,13 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
     if (above := _above(path)) is not None:
         raise CaptureError(f"{path} has no calibration; the capture is the folder above it: give {above}.")
     shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
+    kind = Uncalibrated
     if any(Path(name).suffix.lower() in CALIBRATION_SUFFIXES for name in content):
         kind, why = CaptureError, f"no calibration that is known here; it holds {shown}{unread_files(path)}"
     elif has_frames(path):
-        kind, why = (
-            Uncalibrated,
-            f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures",
-        )
+        why = f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures"
     else:
-        kind, why = Uncalibrated, f"no supported layout; it holds {shown}{unread_files(path)}"
+        why = f"no supported layout; it holds {shown}{unread_files(path)}"
     raise kind(f"The folder {path} has {why}.\n{LAYOUTS_HELP}")
 
 
@@ -382,65 +359,3 @@ def _above(path: Path) -> Path | None:
             if inside.name.lower() in PARTS and _opener(folder) is not None and has_frames(folder):
                 return folder
     return None
-
-
-DIRECTIONS = 360
-ALIKE = 1.5
-"""Cells whose areas differ by less are alike, as cameras are placed by hand; the most central of them is taken."""
-
-
-def best_surrounded(rig: CameraRig) -> str:
-    """The camera with the smallest cell among the others; see Note [Surrounded].
-
-    Among cells of half as much again, the one with the least mean distance to the others, then the first of the rig.
-    The rig's own held-out set plays no part.
-
-    Raises:
-        ConfigError: fewer than three cameras, of which none can be spared.
-    """
-    names = list(rig)
-    if len(names) < 3:
-        raise ConfigError(
-            f"A camera can be held out of three or more, and the rig has {len(names)} ({', '.join(names)}); "
-            "film with another camera, or hold out none."
-        )
-    centers = rig.centers.numpy()
-    extent = float(np.linalg.norm(centers[:, None] - centers, axis=-1).max())
-    if extent == 0:
-        return names[0]
-    cells = np.array([_cell(*_others(rig, name), most=extent) for name in names])
-    away = np.linalg.norm(centers[:, None] - centers, axis=-1).mean(1) / extent
-    alike = np.flatnonzero(cells <= ALIKE * cells.min())
-    # Rounded, so that equal cameras do not differ by the machine's last bit.
-    return names[min(alike, key=lambda index: (round(float(away[index]), 6), index))]
-
-
-def _others(rig: CameraRig, name: str) -> tuple[Floats, Floats]:
-    """Where the others stand in the plane of a camera's picture: angles in radians and distances, each ``[N]``.
-
-    Cameras that look the other way, or stand on its optical axis, are left out.
-    """
-    own = rig[name].viewmat.numpy()
-    angles, distances = [], []
-    for other in rig:
-        if other == name:
-            continue
-        toward = own[:3, :3] @ (rig[other].center.numpy() - rig[name].center.numpy())
-        distance = float(np.linalg.norm(toward))
-        along = float(own[2, :3] @ rig[other].viewmat.numpy()[2, :3])  # cosine between the view directions
-        turned = np.sqrt(max((1 + along) / 2, 0.0))  # of half the angle
-        across = float(np.linalg.norm(toward[:2]))
-        if turned > 1e-3 and across > 1e-6 * distance:
-            angles.append(np.arctan2(toward[1], toward[0]))
-            distances.append(distance / turned)
-    return np.array(angles), np.array(distances)
-
-
-def _cell(angles: Floats, distances: Floats, *, most: float) -> float:
-    """The area of the symmetric cell that ends at ``most``, in circles of that radius."""
-    if not len(angles):
-        return 1.0
-    directions = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    cosines = np.maximum(np.cos(directions[:, None] - angles), 1e-9)
-    reach = np.minimum((distances / cosines).min(1) / most, 1.0)
-    return float((np.maximum(reach, np.roll(reach, DIRECTIONS // 2)) ** 2).mean())

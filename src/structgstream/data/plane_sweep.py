@@ -62,10 +62,7 @@ class SweepConfig:
 
 # Small windows for texture and outlines, then large ones, on pictures reduced until their noise averages out, for
 # surfaces with little texture.
-DEFAULT_LEVELS = (
-    SweepConfig(),
-    SweepConfig(width=96, window=7, noise=0.001, min_margin=0.03, level_planes=True),
-)
+DEFAULT_LEVELS = (SweepConfig(), SweepConfig(width=96, window=7, noise=0.001, min_margin=0.03, level_planes=True))
 
 
 @dataclass(frozen=True)
@@ -121,10 +118,9 @@ def sweep_depth(
     near, far = bounds.depth_range
     limits = (1 / far, 1 / near)
     families = _families(reference.camera, cameras, bounds, config)
-    searches = [_search(reference, neighbours, family, limits, config) for family in families]
     step = (limits[1] - limits[0]) / (len(families[0].inverse_offsets) - 1)
-    inverse, peak, lead = searches[0]
-    for other_inverse, other_peak, other_lead in searches[1:]:
+    (inverse, peak, lead), *others = (_search(reference, neighbours, family, limits, config) for family in families)
+    for other_inverse, other_peak, other_lead in others:
         # Margins compare the families only where their depths differ.
         is_other = np.abs(other_inverse - inverse) > 2 * step
         better = other_peak > peak
@@ -188,17 +184,12 @@ def sweep_points(
                 name: sweep_view(camera, images[name], width=config.width, mask=masks.get(name))
                 for name, camera in cameras.items()
             }
-            pending = {
-                name: pool.submit(
-                    sweep_depth,
-                    views[name],
-                    [views[other] for other in neighbours[name]],
-                    bounds=bounds[name],
-                    config=config,
-                )
-                for name in names
-            }
-            maps = {name: future.result() for name, future in pending.items()}
+
+            def swept(name: str, views: Mapping[str, SweepView] = views, config: SweepConfig = config) -> DepthMap:
+                others = [views[other] for other in neighbours[name]]
+                return sweep_depth(views[name], others, bounds=bounds[name], config=config)
+
+            maps = dict(zip(names, pool.map(swept, names), strict=True))
             for name in names:
                 others = [other for other_name, other in maps.items() if other_name != name]
                 points, mask = consistent_pixels(maps[name], others, config=config)

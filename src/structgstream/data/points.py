@@ -80,10 +80,8 @@ def initial_points(
     """Points ``[P, 3]`` to start the first frame from, in the capture's units, of the training cameras' pictures and
     poses; held-out pictures are never read.
 
-    Absent cameras and pixels that do not count give no points. Where too few are found, random ones replace them, with
-    a warning.
-
-    The result does not depend on the number of threads; ``seed`` is used for random points only.
+    Absent cameras and pixels that do not count give no points. Where too few are found, random ones by ``seed`` replace
+    them, with a warning. The result does not depend on the number of threads.
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     images, masks = {name: frame.images[name] for name in cameras}, frame.masks
@@ -141,15 +139,11 @@ def _sift_points(
         features = dict(zip(cameras, found, strict=True))
 
         def match(pair: Pair) -> Indices:
-            first, second = pair
-            return guided_matches(
-                features[first],
-                features[second],
-                (cameras[first], cameras[second]),
-                line_pixels=config.LINE_PIXELS,
-                depth_range=(config.NEAR_SHARE * distance, config.FAR_SHARE * distance),
-                ratio=config.RATIO,
-            )
+            first, second = (features[name] for name in pair)
+            between = config.NEAR_SHARE * distance, config.FAR_SHARE * distance
+            seen = cameras[pair[0]], cameras[pair[1]]
+            line, ratio = config.LINE_PIXELS, config.RATIO
+            return guided_matches(first, second, seen, line_pixels=line, depth_range=between, ratio=ratio)
 
         matches = dict(zip(pairs, pool.map(match, pairs), strict=True))
     return _confirm_points(cameras, features, matches, tolerance=config.CONFIRM_PIXELS)
@@ -169,9 +163,9 @@ def _confirm_points(
         pixels1, pixels2 = features[first].pixels[match[:, 0]], features[second].pixels[match[:, 1]]
         points, depths = triangulate(cameras[first], cameras[second], pixels1, pixels2)
         for side, (own, other, seen) in enumerate(((first, second, pixels2), (second, first, pixels1))):
-            head = np.tile([order[own], 0.0, order[other]], (len(match), 1))
-            head[:, 1] = match[:, side]
-            records.append(np.concatenate([head, depths[:, side : side + 1], points, seen], 1))
+            own_number, other_number = (np.full(len(match), float(order[name])) for name in (own, other))
+            columns = (own_number, match[:, side], other_number, depths[:, side], points, seen)
+            records.append(np.column_stack(columns))
     if not records:  # poses under which no two cameras see the same
         return np.empty((0, 3))
     table = np.concatenate(records)
@@ -194,14 +188,10 @@ def _sweep_bounds(
 ) -> dict[str, SweepBounds]:
     """Ranges of depth and height of the points, with a margin."""
     up = level_normal(cameras)
-    low, high = np.percentile(points @ up, [1, 99]) if len(points) >= 30 else (0.0, 0.0)
-    room = 0.1 * distance
+    low, high = np.percentile(points @ up, [1, 99]).tolist() if len(points) >= 30 else (0.0, 0.0)
+    heights = low - 0.1 * distance, high + 0.1 * distance
     return {
-        name: SweepBounds(
-            _depth_range(camera, points, distance, config),
-            up if low < high else None,
-            (float(low) - room, float(high) + room),
-        )
+        name: SweepBounds(_depth_range(camera, points, distance, config), up if low < high else None, heights)
         for name, camera in cameras.items()
     }
 

@@ -186,16 +186,8 @@ def of_pictures(
     sizes = {name: _shown_size(file, turns[name]) for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, poses, calibration, path)
-    source = ImageSource(
-        path.name,
-        rig,
-        PICTURE_FPS if fps is None else fps,
-        common,
-        calibration.points,
-        instants,
-        turns=turns,
-    )
-    return source, filmed
+    rate = PICTURE_FPS if fps is None else fps
+    return ImageSource(path.name, rig, rate, common, calibration.points, instants, turns=turns), filmed
 
 
 def _shown_size(file: Path, orientation: int) -> tuple[int, int]:
@@ -350,8 +342,7 @@ def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibra
     filmed, where = {}, calibration.where
     for name, size in sizes.items():
         posed = poses[name]
-        width, height = posed.size or size
-        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
+        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, size=posed.size or size, where=where)
         filmed[name] = LensCamera(at_picture_size(camera, size, name=name, where=where), posed.lens)
     _warn_of_sizes(filmed, poses, where)
     return filmed

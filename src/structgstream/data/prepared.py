@@ -75,8 +75,7 @@ def recognizes_prepared(path: Path) -> bool:
 
 def write_prepared(path: Path, capture: PreparedCapture) -> None:
     """Writes ``capture.json`` into the folder ``path``, whole or not at all."""
-    content = json.dumps(prepared_entries(capture), indent=1) + "\n"
-    atomic_write(path / FILE, content.encode())
+    atomic_write(path / FILE, (json.dumps(prepared_entries(capture), indent=1) + "\n").encode())
 
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
@@ -151,12 +150,15 @@ def undistorted(source: FrameSource, path: Path, capture: PreparedCapture) -> Fr
 
 def filmed_rig(path: Path, capture: PreparedCapture) -> CameraRig:
     """The rig of the pictures before undistortion."""
-    return _rig({name: camera.filmed.camera for name, camera in capture.cameras.items()}, capture, path)
+    where = file if (file := path / FILE).is_file() else path
+    cameras = {name: camera.filmed.camera for name, camera in capture.cameras.items()}
+    return calibrated_rig(cameras, capture.held_out, where=where, near=capture.near)
 
 
 def prepared_rig(path: Path, capture: PreparedCapture) -> CameraRig:
     """The rig of the prepared capture at ``path``: what its pictures are undistorted to."""
-    return _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
+    filmed = filmed_rig(path, capture)
+    return filmed.mapped({name: replace(capture.cameras[name].pinhole, near=capture.near) for name in filmed})
 
 
 def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
@@ -178,10 +180,8 @@ def _of_folders(
     found = {name: pictures_of(folder) for name, folder in files.items()}
     if empty := [name for name, pictures in found.items() if not pictures]:
         raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
-    seconds = {
-        name: capture.cameras[name].clock.common_seconds(own / capture.fps)
-        for name, own in picture_slots(found).items()
-    }
+    slots = picture_slots(found)
+    seconds = {name: capture.cameras[name].clock.common_seconds(slots[name] / capture.fps) for name in found}
     frames, apart = paired(seconds, fps=capture.fps, where=str(path), training=rig.training)
     cut = {}
     for name, pictures in found.items():
@@ -193,11 +193,6 @@ def _of_folders(
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
     return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=apart)
-
-
-def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:
-    where = file if (file := path / FILE).is_file() else path
-    return calibrated_rig(cameras, capture.held_out, where=where, near=capture.near)
 
 
 def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | None:
@@ -225,8 +220,7 @@ def filmed_entry(filmed: LensCamera) -> dict[str, Any]:
 
 def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
     with readable(f"Camera {name!r} of {file}", EXPECTED):
-        width, height = pixels(entry["size"])
-        filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], size=pixels(entry["size"]), where=file)
         parameters = {key: number(value) for key, value in entry["lens"].items() if key != "model"}
         kind = LENSES[entry["lens"]["model"]]
         if unknown := parameters.keys() - {own.name for own in fields(kind)}:  # type: ignore[arg-type]

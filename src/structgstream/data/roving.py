@@ -35,6 +35,7 @@ from structgstream.geometry import Floats
 _log = logging.getLogger(__name__)
 
 INSTANTS = 15  # of the take
+MIN_INSTANTS = 3  # below which none is frequent
 CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which two pixels of the reduced pictures differ
 REDUCED_SIDE = 160  # pixels, to which the longer side is reduced
 REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
@@ -65,13 +66,13 @@ class WithRoving(SourceWrapper):
     def roving(self, frame: MultiViewFrame) -> tuple[RovingPicture, ...]:
         """The pictures for the scene of ``frame``, reduced as the capture's are, and to the size of its largest."""
         name, shown = next(iter(self.rig)), self.pictures[0][1]
-        longest = max(max(own.width, own.height) for own in self.rig.cameras.values())
+        longest = max(side for own in self.rig.cameras.values() for side in (own.width, own.height))
         scale = self.rig[name].width / self.stored[name].width
         scale = min(scale, longest / max(shown.pinhole.width, shown.pinhole.height))
         near, changed = NEAR_SHARE * self.rig[name].near, self._changed(frame)
         undistortion = Undistortion(shown.filmed, shown.pinhole)  # its grids are large: one for all, let go afterwards
         return tuple(
-            self._picture(file, own.pinhole, undistortion, scale=scale, near=near, changed=changed)
+            self._picture(file, replace(own.pinhole.scaled(scale), near=near), undistortion, changed)
             for file, own in self.pictures
         )
 
@@ -84,14 +85,7 @@ class WithRoving(SourceWrapper):
         return hull_points(self.rig, self._changed(frame))
 
     def _picture(
-        self,
-        file: Path,
-        pinhole: Camera,
-        undistortion: Undistortion,
-        *,
-        scale: float,
-        near: float,
-        changed: Mapping[str, NDArray[np.bool_]],
+        self, file: Path, camera: Camera, undistortion: Undistortion, changed: Mapping[str, NDArray[np.bool_]]
     ) -> RovingPicture:
         picture = read_picture(file)
         filmed = undistortion.filmed.camera
@@ -100,7 +94,6 @@ class WithRoving(SourceWrapper):
                 f"The roving picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, expected {filmed.width}x"
                 f"{filmed.height}; prepare the capture again."
             )
-        camera = replace(pinhole.scaled(scale), near=near)
         size = camera.width, camera.height
         image = opencv().resize(undistortion(picture), size, interpolation=opencv().INTER_AREA)
         shown = np.ones(image.shape[:2], bool) if undistortion.shown is None else reduced_mask(undistortion.shown, size)
@@ -131,17 +124,13 @@ class WithRoving(SourceWrapper):
         return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
-MIN_INSTANTS = 3  # below which none is frequent
-
-
 def with_roving(source: FrameSource, whole: FrameSource, folder: Path, capture: PreparedCapture) -> FrameSource:
     """``source``, a part of the prepared ``capture`` in ``folder``, with its roving pictures, where it has some."""
     if not capture.roving:
         return source
-    files = {name: folder / own.files for name, own in capture.roving.items()}
-    if missing := [file for file in files.values() if not file.is_file()]:
+    pictures = tuple((folder / own.files, own) for own in capture.roving.values())
+    if missing := [file for file, _ in pictures if not file.is_file()]:
         raise CaptureError(f"The roving picture {missing[0]} is missing; restore it, or prepare the capture again.")
-    pictures = tuple((files[name], own) for name, own in capture.roving.items())
     stored = source.rig.mapped({name: capture.cameras[name].pinhole for name in source.rig})
     return WithRoving(source, whole, pictures, stored)
 
@@ -149,7 +138,7 @@ def with_roving(source: FrameSource, whole: FrameSource, folder: Path, capture: 
 def roving_of(source: FrameStream) -> WithRoving | None:
     """The source of roving pictures among the wrappers of ``source``; None without any."""
     inner: Any = source
-    while inner is not None and not isinstance(inner, WithRoving):
+    while not isinstance(inner, WithRoving | None):
         inner = getattr(inner, "source", None)
     return inner
 
@@ -178,10 +167,10 @@ def joined(
     rig: CameraRig, frame: MultiViewFrame, pictures: Sequence[RovingPicture]
 ) -> tuple[MultiViewFrame, CameraRig]:
     """A frame and its rig, with the roving pictures as further cameras."""
-    more = {f"{ROVING}/{number}": own for number, own in enumerate(pictures)}
-    images = {**frame.images, **{name: own.image for name, own in more.items()}}
-    masks = {**frame.masks, **{name: own.mask for name, own in more.items()}}
-    cameras = {**rig.cameras, **{name: own.camera for name, own in more.items()}}
+    images, masks, cameras = dict(frame.images), dict(frame.masks), dict(rig.cameras)
+    for number, own in enumerate(pictures):
+        name = f"{ROVING}/{number}"
+        images[name], masks[name], cameras[name] = own.image, own.mask, own.camera
     return replace(frame, images=images, masks=masks), CameraRig(cameras, rig.held_out)
 
 

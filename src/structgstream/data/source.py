@@ -170,10 +170,8 @@ class Resized(WithRig):
         cv2 = opencv()
         sizes = {name: (self.rig[name].width, self.rig[name].height) for name in self.rig}
         for frame in self.source.frames(start):
-            images = {
-                name: cv2.resize(image, sizes[name], interpolation=cv2.INTER_AREA)
-                for name, image in frame.images.items()
-            }
+            own = frame.images.items()
+            images = {name: cv2.resize(image, sizes[name], interpolation=cv2.INTER_AREA) for name, image in own}
             masks = {name: reduced_mask(mask, sizes[name]) for name, mask in frame.masks.items()}
             yield replace(frame, images=images, masks=masks)
 
@@ -329,11 +327,7 @@ class Prefetch(SourceWrapper):
     """The same frames, :data:`AHEAD` of them decoded ahead in a background thread."""
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        """The frames from stream index ``start``.
-
-        An error of the source is raised in place of the frame that it concerns. Closing the iterator, or an
-        exception in its consumer, ends the thread within the decoding of one frame.
-        """
+        """The frames from stream index ``start``; see :class:`~structgstream.lookahead.Lookahead`."""
         with Lookahead(self.source.frames(start), depth=AHEAD) as frames:
             yield from frames
 
@@ -389,8 +383,10 @@ class SharedFrames:
                 return self._cached[index]
             if self._failed is not None:
                 raise self._failed
-            again = index < self._next
-        return self._again(index) if again else None
+            if index >= self._next:
+                return None
+        with closed(self._source.frames(index)) as frames:  # one of before
+            return next(frames, None)
 
     def retain(self, reader: int, first: int, *, last: int) -> None:
         """Retains what a reader needs again when it is resumed: see ``RetainsFrames``."""
@@ -411,26 +407,19 @@ class SharedFrames:
         self._reading = True
         if self._frames is None:
             self._frames = self._source.frames(self._next)
-        frames = self._frames
+        frames, found = self._frames, None
         self._changed.release()
-        found, failed = None, None
         try:
             found = next(frames, None)
         except BaseException as error:  # raised in every reader
-            failed = error
+            self._failed = error
         finally:
             self._changed.acquire()
-            self._reading = False
-            self._failed, self._ended = failed, found is None
+            self._reading, self._ended = False, found is None
             if found is not None:
                 self._cached[self._next] = found
                 self._next += 1
             self._changed.notify_all()
-
-    def _again(self, index: int) -> MultiViewFrame | None:
-        """A frame of before."""
-        with closed(self._source.frames(index)) as frames:
-            return next(frames, None)
 
     def _retain(self) -> None:
         firsts = dict.fromkeys(first for first, _ in self._needs)
@@ -444,9 +433,8 @@ class _Reader(SourceFacts[FrameStream]):
         self._shared, self.source, self._number = shared, source, number
 
     def retain(self, *first: int, last: int) -> None:
-        """See ``RetainsFrames``."""
-        (one,) = first
-        self._shared.retain(self._number, one, last=last)
+        """See ``RetainsFrames``; it needs one frame."""
+        self._shared.retain(self._number, *first, last=last)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         """The frames from ``start`` on; one that was the last asked for may be asked for again."""

@@ -12,12 +12,12 @@ import os
 import re
 import struct
 import tomllib
-import unicodedata
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,28 +49,30 @@ def read_text(file: Path) -> str:
     except UnicodeDecodeError as error:
         place = error.start + len(data) - len(error.object)  # which lacks the mark
         raise Unreadable(f"it is no Unicode text from byte {place} on; save it as UTF-8") from None
-    return unicodedata.normalize("NFC", text.replace("\r\n", "\n").replace("\r", "\n"))
+    return normalize("NFC", text.replace("\r\n", "\n").replace("\r", "\n"))
 
 
 def read_json(file: Path) -> Any:
     """The content of a JSON file."""
+    text = read_text(file)
     try:
-        return json.loads(read_text(file))
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise Unreadable(f"it is not JSON from line {error.lineno}, column {error.colno} on") from None
-    except (RecursionError, ValueError) as error:
-        raise error if isinstance(error, Unreadable) else Unreadable("it is not JSON of a calibration") from None
+    except (RecursionError, ValueError):
+        raise Unreadable("it is not JSON of a calibration") from None
 
 
 def read_toml(file: Path) -> dict[str, Any]:
     """The content of a TOML file."""
+    text = read_text(file)
     try:
-        return tomllib.loads(read_text(file))
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         place = re.search(r"at (line \d+, column \d+|end of document)", str(error))
         raise Unreadable(f"it is not TOML at {place[1] if place else 'some place'}") from None
-    except (RecursionError, ValueError) as error:
-        raise error if isinstance(error, Unreadable) else Unreadable("it is not TOML of a calibration") from None
+    except (RecursionError, ValueError):
+        raise Unreadable("it is not TOML of a calibration") from None
 
 
 def number(value: Any) -> float:
@@ -163,8 +165,7 @@ def readable(what: Path | str, expected: str) -> Iterator[None]:
 
 def path_parts(text: str) -> tuple[str, ...]:
     """The parts of a path of any system: of ``C:\\data\\cam0\\1.png`` they are ``data``, ``cam0`` and ``1.png``."""
-    plain = re.sub(r"^(file://|[A-Za-z]:(?=[\\/]))", "", text.strip()).replace("\\", "/")
-    plain = unicodedata.normalize("NFC", plain)
+    plain = re.sub(r"^(file://|[A-Za-z]:(?=[\\/]))", "", normalize("NFC", text.strip())).replace("\\", "/")
     return tuple(part for part in PurePosixPath(plain).parts if part not in ("/", "//"))
 
 
@@ -202,10 +203,10 @@ class NamedFiles:
             for entry in path.parent.iterdir() if path.parent.is_dir() else ():
                 found.setdefault(_stem(entry, self._suffixes), []).append(entry)
         same = self._listings[path.parent].get(_stem(path, self._suffixes), [])
-        exact = next((entry for entry in same if unicodedata.normalize("NFC", entry.name) == path.name), None)
+        exact = next((entry for entry in same if normalize("NFC", entry.name) == path.name), None)
         others = [entry for entry in same if entry.suffix.lower() in self._suffixes]
         return exact or (others[0] if len(others) == 1 else None)
 
 
 def _stem(path: Path, suffixes: Collection[str]) -> str:
-    return unicodedata.normalize("NFC", path.stem if path.suffix.lower() in suffixes else path.name)
+    return normalize("NFC", path.stem if path.suffix.lower() in suffixes else path.name)

@@ -84,9 +84,8 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     if not all(numbered.values()):
         return keys
     words = {name: re.sub(r"[\W\d_]+", "", own[0].replace(name, "")) for name, own in stems.items()}
-    if len(set(words.values())) > 1:
-        first = next(iter(words))
-        other = next(name for name in words if words[name] != words[first])
+    first = next(iter(words))
+    if other := next((name for name in words if words[name] != words[first]), None):
         log.warning(
             "The pictures of cameras %r (%s) and %r (%s) have other names, and are matched by their numbers alone; if "
             "these are not of one count, name pictures of one instant alike",
@@ -129,13 +128,11 @@ def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, Indices]:
     return {name: np.array([slot_of[stem] for stem in own]) for name, own in stems.items()}
 
 
-def common_slots(
-    slots: Mapping[str, Sequence[int]],
-    *,
-    where: str,
-    label: Callable[[int], str],
-    training: Collection[str],
-) -> range:
+Slots = Mapping[str, Sequence[int]]
+"""By camera the slots it has, ascending; a slot is one instant of the common timeline."""
+
+
+def common_slots(slots: Slots, *, where: str, label: Callable[[int], str], training: Collection[str]) -> range:
     """The range of slots of a capture, of which cameras may lack some.
 
     It begins where the last camera begins, and ends where most cameras have ended: with the last slot that at least
@@ -143,7 +140,6 @@ def common_slots(
     lack. What is left out, and which cameras are absent from when on, is logged once for each camera.
 
     Args:
-        slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
         label: names the instant of a slot, for messages ("at 0.133 s", "000017").
         training: names of the cameras that are not held out.
 
@@ -153,16 +149,15 @@ def common_slots(
     for camera, own in slots.items():
         if not own:
             raise CaptureError(f"Camera {camera!r} of {where} has no frames; add them or remove the camera.")
-    first, last = max(own[0] for own in slots.values()), _end(slots, training)
-    lost = next((camera for camera, own in slots.items() if not any(first <= slot <= last for slot in own)), None)
-    if lost is not None:
-        late = next(camera for camera, own in slots.items() if own[0] == first)
-        early = min(slots, key=lambda camera: slots[camera][-1]) if lost == late else lost
+    late = max(slots, key=lambda camera: slots[camera][0])
+    first, last = slots[late][0], _end(slots, training)
+    inside = {camera: [slot for slot in own if first <= slot <= last] for camera, own in slots.items()}
+    if lost := [camera for camera, own in inside.items() if not own]:
+        early = min(slots, key=lambda camera: slots[camera][-1]) if lost[0] == late else lost[0]
         raise CaptureError(
             f"The cameras of {where} have no frames in common: {early!r} ends with {label(slots[early][-1])} "
             f"and {late!r} starts with {label(first)}; check that all belong to one take and share one clock."
         )
-    inside = {camera: [slot for slot in own if first <= slot <= last] for camera, own in slots.items()}
     for camera, own in inside.items():
         repeated = next((a for a, b in pairwise(own) if a == b), None)
         if repeated is not None:
@@ -170,24 +165,19 @@ def common_slots(
                 f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
                 "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
-    starts, ends = min(own[0] for own in slots.values()), max(own[-1] for own in slots.values())
-    if first > starts:
-        late = next(camera for camera, own in slots.items() if own[0] == first)
-        log.warning(
-            "%s: camera %r starts with %s; %d earlier frames of other cameras are left out",
-            where, late, label(first), first - starts,
-        )  # fmt: skip
-    if last < ends:
+    if before := first - min(own[0] for own in slots.values()):
+        text = "%s: camera %r starts with %s; %d earlier frames of other cameras are left out"
+        log.warning(text, where, late, label(first), before)
+    if after := max(own[-1] for own in slots.values()) - last:
         early = next(camera for camera, own in slots.items() if own[-1] == last)
-        log.warning(
-            "%s: camera %r ends with %s; %d later frames of other cameras are left out",
-            where, early, label(last), ends - last,
-        )  # fmt: skip
-    _log_absences(inside, first, last, where=where, label=label, training=training)
-    return range(first, last + 1)
+        text = "%s: camera %r ends with %s; %d later frames of other cameras are left out"
+        log.warning(text, where, early, label(last), after)
+    common = range(first, last + 1)
+    _log_absences(inside, common, where, label, training)
+    return common
 
 
-def _end(slots: Mapping[str, Sequence[int]], training: Collection[str]) -> int:
+def _end(slots: Slots, training: Collection[str]) -> int:
     """The last slot that half of the cameras, and two training cameras, reach."""
     ends = sorted((own[-1] for own in slots.values()), reverse=True)
     trained = sorted((own[-1] for name, own in slots.items() if name in training), reverse=True)
@@ -196,43 +186,30 @@ def _end(slots: Mapping[str, Sequence[int]], training: Collection[str]) -> int:
 
 
 def _log_absences(
-    slots: Mapping[str, Sequence[int]],
-    first: int,
-    last: int,
-    *,
-    where: str,
-    label: Callable[[int], str],
-    training: Collection[str],
+    slots: Slots, common: range, where: str, label: Callable[[int], str], training: Collection[str]
 ) -> None:
-    """Warnings of absent cameras; ``slots`` are those of the range."""
-    count = last - first + 1
-    gaps = {camera: sorted({*range(first, own[-1] + 1)}.difference(own)) for camera, own in slots.items()}
+    """Warnings of absent cameras; ``slots`` are those of the range ``common``."""
+    gaps = {camera: sorted({*range(common.start, own[-1] + 1)}.difference(own)) for camera, own in slots.items()}
     gaps = {camera: lacking for camera, lacking in gaps.items() if lacking}
     if len(gaps) > MAX_SINGLE:
         listed = ", ".join(f"{camera!r} {len(lacking)}" for camera, lacking in gaps.items())
-        log.warning("%s: %d cameras lack some of %d frames and are absent there: %s", where, len(gaps), count, listed)
+        text = "%s: %d cameras lack some of %d frames and are absent there: %s"
+        log.warning(text, where, len(gaps), len(common), listed)
         gaps = {}
     for camera, own in slots.items():
         if lacking := gaps.get(camera):
-            log.warning(
-                "%s: camera %r lacks %d of %d frames, the first of them %s; it is absent there",
-                where, camera, len(lacking), count, label(lacking[0]),
-            )  # fmt: skip
-        if own[-1] < last:
-            log.warning(
-                "%s: camera %r ends with %s; it is absent from the %d frames after that",
-                where, camera, label(own[-1]), last - own[-1],
-            )  # fmt: skip
-    seeing = np.zeros(count, np.int64)
-    for camera, own in slots.items():
-        if camera in training:
-            seeing[np.array(own) - first] += 1
-    sparse = np.flatnonzero(seeing < MIN_CAMERAS)
-    if len(sparse) and len(training) >= MIN_CAMERAS:
+            text = "%s: camera %r lacks %d of %d frames, the first of them %s; it is absent there"
+            log.warning(text, where, camera, len(lacking), len(common), label(lacking[0]))
+        if after := common[-1] - own[-1]:
+            text = "%s: camera %r ends with %s; it is absent from the %d frames after that"
+            log.warning(text, where, camera, label(own[-1]), after)
+    seeing = Counter(slot for camera, own in slots.items() if camera in training for slot in own)
+    sparse = [slot for slot in common if seeing[slot] < MIN_CAMERAS]
+    if sparse and len(training) >= MIN_CAMERAS:
         log.warning(
             "%s: %d frames, the first of them %s, have pictures of fewer than %d training cameras, so a reconstruction "
             "stops there; restore them, or choose frames before or after",
-            where, len(sparse), label(first + int(sparse[0])), MIN_CAMERAS,
+            where, len(sparse), label(sparse[0]), MIN_CAMERAS,
         )  # fmt: skip
 
 
@@ -257,21 +234,16 @@ class Placed:
 
 def place(positions: Floats) -> Placed:
     """The frames of a camera at ``positions`` ``[n]``, ascending: their times in periods, instants being integers."""
-    shift = _steady_phase(positions)
+    mean = np.exp(2j * np.pi * positions).mean()
+    shift = float(np.angle(mean) / (2 * np.pi)) if abs(mean) > STEADY else 0.0
     slots = np.rint(positions - shift).astype(np.int64)
     errors = positions - slots
     steps = np.diff(positions)
-    close = steps < DUPLICATE * float(np.median(steps)) if len(steps) else np.zeros(0, bool)
+    close = steps < DUPLICATE * np.median(steps) if len(steps) else np.zeros(0, bool)
     repeated = slots[1:][close & (slots[1:] == slots[:-1])]
     order = np.lexsort((np.abs(errors), slots))
     chosen = order[np.unique(slots[order], return_index=True)[1]]
     return Placed(slots[chosen], chosen.astype(np.int64), errors[chosen], tuple(map(int, repeated)))
-
-
-def _steady_phase(positions: Floats) -> float:
-    """The distance in periods, within half a one, that all frames keep to the instants; 0 if they do not."""
-    mean = np.exp(2j * np.pi * positions).mean()
-    return float(np.angle(mean) / (2 * np.pi)) if abs(mean) > STEADY else 0.0
 
 
 def origin_of(positions: Sequence[Floats]) -> float:
@@ -303,9 +275,7 @@ def counted_rate(seconds: Sequence[Floats]) -> float | None:
     rate would leave the frames.
     """
     rates = []
-    for own in seconds:
-        if len(own) < 2:
-            continue
+    for own in (own for own in seconds if len(own) > 1):
         steps = np.diff(own)
         # A long step stands for missing frames, a short one is jitter.
         frames = np.maximum(np.rint(steps / max(float(np.median(steps)), 1e-9)), 1).sum()
@@ -344,15 +314,15 @@ def paired(
     frames: dict[str, list[int | None]] = {}
     apart: dict[str, Floats] = {}
     for name, own in placed.items():
-        row_of = {slot: row for row, slot in enumerate(own.slots.tolist())}
-        rows = [row_of.get(instant) for instant in common]
-        frames[name] = [None if row is None else int(own.frames[row]) for row in rows]
-        apart[name] = np.array([np.nan if row is None else own.errors[row] for row in rows]) / fps
-    worst = {name: 1e3 * float(np.nanmax(np.abs(own))) for name, own in apart.items()}
-    camera = max(worst, key=lambda name: worst[name])
+        frame_of = dict(zip(own.slots.tolist(), own.frames.tolist()))
+        error_of = dict(zip(own.slots.tolist(), own.errors.tolist()))
+        frames[name] = [frame_of.get(instant) for instant in common]
+        apart[name] = np.array([error_of.get(instant, np.nan) for instant in common]) / fps
+    milliseconds = {name: 1e3 * float(np.nanmax(np.abs(own))) for name, own in apart.items()}
+    camera, worst = max(milliseconds.items(), key=lambda own: own[1])
     text = "%s: pictures lie up to %.1f ms from their instants (camera %r)"
-    if worst[camera] > 5:
-        log.warning(text + "; what moves fast will not agree between cameras", where, worst[camera], camera)
+    if worst > 5:
+        log.warning(text + "; what moves fast will not agree between cameras", where, worst, camera)
     else:
-        log.info(text, where, worst[camera], camera)
+        log.info(text, where, worst, camera)
     return frames, apart

@@ -51,14 +51,13 @@ FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture of a file of transforms: its camera, where it lies, when it was taken, whether it is held out, and
-    whether the file names a mask of it."""
+    """A picture of a file of transforms."""
 
     camera: PosedCamera
     file: Path
-    time: float | None
+    time: float | None  # when it was taken
     held_out: bool
-    masked: bool
+    masked: bool  # whether the file names a mask of it
 
 
 def find(folder: Path) -> tuple[Path, ...]:
@@ -88,19 +87,17 @@ def _shots_of(file: Path) -> list[Shot]:
         frames = [{**content, **mapping(frame)} for frame in content["frames"]]
         entries = [(str(frame["file_path"]), frame) for frame in frames]
     pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
-    taken: list[tuple[Path, float | None, bool]] = []
+    shots: list[Shot] = []
 
     def camera(name: str, frame: dict[str, Any]) -> PosedCamera:
         picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
         time = None if frame.get("time") is None else number(frame["time"])
-        taken.append((picture, time, frame.get("mask_path") is not None))
-        return _camera(name, frame, picture, file)
+        posed = _camera(name, frame, picture, file)
+        shots.append(Shot(posed, picture, time, file.name == TEST, frame.get("mask_path") is not None))
+        return posed
 
-    cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
-    return [
-        Shot(posed, picture, time, file.name == TEST, masked)
-        for posed, (picture, time, masked) in zip(cameras, taken, strict=True)
-    ]
+    calibration_of(entries, camera, file=file, expected=EXPECTED)
+    return shots
 
 
 def stated_fps(file: Path) -> float | None:
@@ -176,9 +173,8 @@ def open_transforms(path: Path) -> FrameSource:
     pictures = {name: _instants(own, zero) for name, own in cameras.items()}
     poses = {name: own[0].camera for name, own in cameras.items()}
     held_out = [name for name, own in cameras.items() if own[0].held_out]
-    calibration = Calibration(files[0], tuple(poses.values()), held_out=held_out)
-    source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration, fps=stated_fps(files[0]))
-    return undistort(source, filmed)
+    found = Calibration(files[0], tuple(poses.values()), held_out=held_out)
+    return undistort(*of_pictures(path, pictures, poses, root=path, calibration=found, fps=stated_fps(files[0])))
 
 
 def _by_pose(shots: Sequence[Shot], where: Path) -> Mapping[str, Sequence[Shot]]:

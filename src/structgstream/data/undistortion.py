@@ -65,7 +65,7 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
 
 
 def check_field_of_view(degrees: float) -> None:
-    """Refuses what is no angle across a plane."""
+    """Check an angle across a plane. Raises ConfigError."""
     if not 0 < degrees < 175:
         raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
 
@@ -118,8 +118,7 @@ SCALE_SAMPLES = 33
 class Level:
     """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid."""
 
-    rows: slice  # of the pinhole's picture
-    columns: slice  # of the pinhole's picture
+    part: tuple[slice, slice]  # rows and columns of the pinhole's picture
     maps: tuple[NDArray[np.generic], NDArray[np.generic]]
     """Source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel."""
     weights: NDArray[np.float32] | None
@@ -141,18 +140,17 @@ class Undistortion:
     def __call__(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """``[H, W, 3]`` of the lens to ``[H, W, 3]`` of the pinhole; black where the lens shows nothing."""
         cv2 = opencv()
-        result = None
+        result = picture
         for number, level in enumerate(self._levels):
             size = self._size(number)
             if picture.shape[1::-1] != size:
                 picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
             taken = cv2.remap(picture, *level.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            if result is None or level.weights is None:
+            if level.weights is None:
                 result = taken
             else:
-                finer = result[level.rows, level.columns]
-                result[level.rows, level.columns] = cv2.blendLinear(finer, taken, 1 - level.weights, level.weights)
-        assert result is not None
+                blended = cv2.blendLinear(result[level.part], taken, 1 - level.weights, level.weights)
+                result[level.part] = blended
         if self.shown is not None:
             result[~self.shown] = 0
         return result
@@ -166,8 +164,7 @@ class Undistortion:
             # Bicubic sampling reads from one pixel before to two behind.
             whole = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
             taken = cv2.remap(whole, *level.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
-            used = np.ones(taken.shape, bool) if level.weights is None else level.weights > 0
-            result[level.rows, level.columns] &= taken | ~used
+            result[level.part] &= taken if level.weights is None else taken | (level.weights <= 0)
         return result
 
     @cached_property
@@ -197,7 +194,7 @@ class Undistortion:
         # Beyond the lens any place will do: those pixels become black.
         found = np.clip(np.nan_to_num(found, nan=-1.0), -1, (width, height)).astype(np.float32)
         maps = cv2.convertMaps(found[..., 0], found[..., 1], cv2.CV_16SC2)
-        return Level(*part, maps, share[part].astype(np.float32) if number else None)
+        return Level(part, maps, share[part].astype(np.float32) if number else None)
 
     def _size(self, number: int) -> tuple[int, int]:
         """The size of the lens's picture after so many halvings; at first it is reduced as far as nothing is lost."""
@@ -208,16 +205,14 @@ class Undistortion:
     @cached_property
     def _min_scale(self) -> float:
         """Least pixels of the lens, along any direction, in a pixel of the pinhole."""
-        across = np.linspace(1, self.target.width - 1, SCALE_SAMPLES)
-        down = np.linspace(1, self.target.height - 1, SCALE_SAMPLES)
-        pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
+        sides = (np.linspace(1, side - 1, SCALE_SAMPLES) for side in (self.target.width, self.target.height))
+        pixels = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
         straight = LensCamera(self.target, Pinhole())
-        steps = [
-            self.filmed.to_pixels(straight.to_normalized(pixels + axis))
-            - self.filmed.to_pixels(straight.to_normalized(pixels - axis))
-            for axis in np.eye(2) / 2
-        ]
-        jacobians = np.stack(steps, -1)
+
+        def filmed(moved: Floats) -> Floats:
+            return self.filmed.to_pixels(straight.to_normalized(pixels + moved))
+
+        jacobians = np.stack([filmed(axis) - filmed(-axis) for axis in np.eye(2) / 2], -1)
         jacobians = jacobians[np.isfinite(jacobians).all((-1, -2))]
         return float(np.linalg.svd(jacobians, compute_uv=False).min()) if len(jacobians) else 1.0
 
@@ -247,13 +242,12 @@ class UndistortedSource(WithRig):
     """
 
     filmed: Mapping[str, LensCamera]
-    _plans: dict[str, Undistortion | None] = field(default_factory=dict, init=False, repr=False, compare=False)
     _masks: dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        plans = {name: self._plan(name) for name in self.rig}
+        plans = self.plans
 
         def pinhole(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
             return picture if (plan := plans[name]) is None else plan(picture)
@@ -270,14 +264,19 @@ class UndistortedSource(WithRig):
         """The same frames at the sizes of ``rig``, resampled once."""
         return replace(self, other=rig)
 
-    def is_unchanged(self, name: str) -> bool:
-        """Whether the pictures of a camera are passed through."""
-        filmed = self.filmed[name]
-        return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
+    @cached_property
+    def plans(self) -> Mapping[str, Undistortion | None]:
+        """What resamples the pictures of each camera; None for those that are passed through."""
+
+        def changes(name: str) -> bool:
+            filmed = self.filmed[name]
+            return not (isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K))
+
+        return {name: Undistortion(self.filmed[name], self.rig[name]) if changes(name) else None for name in self.rig}
 
     def _mask(self, name: str, given: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Which pixels of the pinhole count: those that the lens shows and that no mask of its picture leaves out."""
-        plan = self._plan(name)
+        plan = self.plans[name]
         if plan is None or given is None:
             return given if plan is None else plan.shown
         known = self._masks.get(name)
@@ -285,11 +284,6 @@ class UndistortedSource(WithRig):
             mask = plan.mask(given)
             known = self._masks[name] = (given, mask if plan.shown is None else mask & plan.shown)
         return known[1]
-
-    def _plan(self, name: str) -> Undistortion | None:
-        if name not in self._plans:
-            self._plans[name] = None if self.is_unchanged(name) else Undistortion(self.filmed[name], self.rig[name])
-        return self._plans[name]
 
 
 def lenses_of(source: FrameSource) -> Mapping[str, LensCamera] | None:
@@ -325,4 +319,4 @@ def undistort(
 def undistorted_to(pinholes: CameraRig, source: FrameSource, filmed: Mapping[str, LensCamera]) -> FrameSource:
     """``source``, taken with lenses, for these pinholes; the source itself if that changes nothing."""
     made = UndistortedSource(source, pinholes, filmed)
-    return source if all(made.is_unchanged(name) for name in pinholes) else made
+    return made if any(made.plans.values()) else source

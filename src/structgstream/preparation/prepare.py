@@ -17,9 +17,10 @@ from structgstream.atomic_files import atomic_file
 from structgstream.cameras import NEAR_IN_RIG_RADII, CameraRig, rig_radius
 from structgstream.data.calibration import Calibration, listed
 from structgstream.data.camera_files import REPORT
+from structgstream.data.camera_spacing import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.masks import masks_folder
-from structgstream.data.open import best_surrounded, open_capture
+from structgstream.data.open import open_capture
 from structgstream.data.prepared import (
     ROVING,
     PreparedCamera,

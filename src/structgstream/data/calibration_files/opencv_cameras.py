@@ -14,9 +14,8 @@ import numpy as np
 
 from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, rigid
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, may_be_storage, read_storage
-from structgstream.data.calibration_files.tools import EXTRINSICS, INTRINSICS, decompose_projection
-from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
-from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason
+from structgstream.data.calibration_files.tools import EXTRINSICS, INTRINSICS, decompose_projection, opencv_camera
+from structgstream.data.text_files import Unreadable, number, read_text, reason
 from structgstream.errors import CalibrationError
 
 EXPECTED = (
@@ -47,13 +46,10 @@ FISHEYES = re.compile(r"fish|equidist|\bequi\b|kannala")
 OTHER_LENSES = re.compile(r"omni(?!vision)|unified|ucm|double.?sphere|division|equirect")
 """Words in the names of lens models: of OpenCV's fisheye, and of those that are not known here. Others are OpenCV's or
 names of products."""
+POSE_SHAPES = {(3, 4): (3, 4), (12,): (3, 4), (4, 4): (4, 4), (16,): (4, 4)}
 SHAPES = {
-    "K": {(3, 3): (3, 3), (9,): (3, 3)},
-    **{
-        key: {(3, 4): (3, 4), (12,): (3, 4), (4, 4): (4, 4), (16,): (4, 4)}
-        for key in ("pose", "inverse pose", "projection")
-    },
-}
+    "K": {(3, 3): (3, 3), (9,): (3, 3)}, "pose": POSE_SHAPES, "inverse pose": POSE_SHAPES, "projection": POSE_SHAPES,
+}  # fmt: skip
 """What a matrix may look like, as a list or as rows, and what it is then."""
 SUFFIXES = (".xml", ".yml", ".yaml", ".json")
 
@@ -141,19 +137,11 @@ def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
         raise KeyError("camera_matrix or intrinsics or K")
     size = _value(content, "size")
     width, height = (_value(size if isinstance(size, dict) else content, key) for key in ("width", "height"))
-    size = None if isinstance(size, dict) else size
+    size = None if size is None or isinstance(size, dict) else np.ravel(size).tolist()
     if size is None and width is not None and height is not None and number(width) > 0 and number(height) > 0:
         size = (width, height)
-    coefficients = _value(content, "distortion")
-    return PosedCamera(
-        name=name,
-        viewmat=_pose(content),
-        K=from_integer_centers(K),
-        size=None if size is None else pixels(np.ravel(size).tolist()),
-        lens=(fisheye_lens if _is_fisheye(content) else opencv_lens)(
-            [] if coefficients is None else np.ravel(coefficients).tolist()
-        ),
-    )
+    dist = _value(content, "distortion")
+    return opencv_camera(name, _pose(content), K=K, dist=dist, size=size, fisheye=_is_fisheye(content))
 
 
 def _is_fisheye(content: dict[str, Any]) -> bool:
@@ -177,8 +165,7 @@ def _pose(content: dict[str, Any]) -> np.ndarray:
     """World to camera, ``[4, 4]``."""
     for key in ("pose", "inverse pose"):
         if (matrix := _value(content, key)) is not None:
-            viewmat = np.eye(4)
-            viewmat[: len(matrix)] = matrix
+            viewmat = np.vstack([matrix, np.eye(4)[len(matrix) :]])
             return np.linalg.inv(viewmat) if key == "inverse pose" else viewmat
     rotation, translation = _value(content, "rotation"), _value(content, "translation")
     if rotation is None or translation is None:

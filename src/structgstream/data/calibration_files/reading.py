@@ -60,7 +60,7 @@ def read_storage(file: Path) -> dict[str, Any]:
     """Everything in the file: matrices as arrays, maps, lists, and text, also that of numbers."""
     text = read_text(file)
     if "<opencv_storage" in text[:400]:
-        return _of_xml(text)
+        return {child.tag: _value(_element(child)) for child in parsed_xml(text.strip())}
     return mapping(_value(read_json(file) if text.lstrip().startswith("{") else parsed_yaml(text)))
 
 
@@ -77,13 +77,13 @@ def parsed_yaml(text: str) -> Any:
         raise Unreadable("it is not YAML") from None
 
 
-def _of_xml(text: str) -> dict[str, Any]:
+def parsed_xml(text: str | bytes) -> ET.Element:
+    """The root of XML."""
     try:
-        root = ET.fromstring(text.strip())
+        return ET.fromstring(text)
     except (ET.ParseError, ValueError) as error:
         line = f" at line {error.position[0]}" if isinstance(error, ET.ParseError) else ""
         raise Unreadable(f"it is not XML{line}") from None
-    return {child.tag: _value(_element(child)) for child in root}
 
 
 def _element(tag: ET.Element) -> Any:

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, intrinsics, rigid
 from structgstream.data.calibration_files.reading import (
     json_files_with,
     load_plain,
+    parsed_xml,
     parsed_yaml,
     read_storage,
     recognized,
@@ -26,31 +27,26 @@ from structgstream.data.calibration_files.reading import (
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json, read_text, read_toml, readable
 from structgstream.errors import CalibrationError
+from structgstream.geometry import Floats
 
 CENTIMETRE, MILLIMETRE = 0.01, 0.001
 Entries = Iterator[tuple[str, Any]]
 
 
 def opencv_camera(
-    name: str, *, K: ArrayLike, dist: Any, R: Any, T: Any, size: Any = None, unit: float = 1.0, fisheye: bool = False
+    name: str, viewmat: Floats, *, K: ArrayLike, dist: Any, size: Any = None, fisheye: bool = False
 ) -> PosedCamera:
     """A camera in OpenCV's conventions.
 
     Args:
+        viewmat: world to camera ``[4, 4]``.
         K: intrinsics ``[3, 3]``, pixels, the top-left pixel's centre at (0, 0).
         dist: coefficients in OpenCV's order, of any shape, or of its fisheye model; None for none.
-        R: rotation, world to camera, as matrix ``[3, 3]`` or vector ``[3]``.
-        T: translation ``[3]``, in ``unit`` metres.
         size: width and height, pixels; None if unknown.
     """
     coefficients = [] if dist is None else np.ravel(dist).tolist()
-    return PosedCamera(
-        name=name,
-        viewmat=rigid(R, unit * np.array(T, dtype=np.float64)),
-        K=from_integer_centers(K),
-        size=None if size is None else pixels(size),
-        lens=(fisheye_lens if fisheye else opencv_lens)(coefficients),
-    )
+    lens = (fisheye_lens if fisheye else opencv_lens)(coefficients)
+    return PosedCamera(name, viewmat, from_integer_centers(K), None if size is None else pixels(size), lens)
 
 
 # aniposelib: TOML with a table per camera, at the top or below ``cameras``. Anipose, caliscope, Pose2Sim and FreeMoCap
@@ -84,9 +80,9 @@ def _anipose_entries(files: tuple[Path, ...]) -> Entries:
 def _anipose_camera(name: str, table: dict[str, Any]) -> PosedCamera:
     if all(table.get(key, "null") == "null" for key in ("rotation", "translation")):  # as earlier caliscopes write none
         raise NoPose
-    K, dist, fisheye = table["matrix"], table["distortions"], bool(table.get("fisheye"))
-    R, T = table["rotation"], table["translation"]
-    return opencv_camera(name, K=K, dist=dist, R=R, T=T, size=table["size"], fisheye=fisheye)
+    viewmat, fisheye = rigid(table["rotation"], table["translation"]), bool(table.get("fisheye"))
+    K, dist = table["matrix"], table["distortions"]
+    return opencv_camera(name, viewmat, K=K, dist=dist, size=table["size"], fisheye=fisheye)
 
 
 # EasyMocap and EasyVolcap, as ENeRF-Outdoor is published: intri.yml and extri.yml with ``names`` and keys per camera.
@@ -112,7 +108,7 @@ def _easymocap_camera(name: str, content: dict[str, Any]) -> PosedCamera:
     R = content[f"Rot_{name}"] if f"Rot_{name}" in content else content[f"R_{name}"]
     size = (content.get(f"W_{name}", -1), content.get(f"H_{name}", -1))
     known_size = size if min(map(number, size)) > 0 else None
-    return opencv_camera(name, K=content[f"K_{name}"], dist=dist, R=R, T=content[f"T_{name}"], size=known_size)
+    return opencv_camera(name, rigid(R, content[f"T_{name}"]), K=content[f"K_{name}"], dist=dist, size=known_size)
 
 
 # multical: calibration.json with ``cameras`` and ``camera_poses``. Poses map the rig to the camera; those of a name
@@ -126,9 +122,9 @@ def _multical_entries(files: tuple[Path, ...]) -> Entries:
     return ((name, (entry, poses)) for name, entry in mapping(content["cameras"]).items())
 
 
-def _absolute_poses(entries: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+def _absolute_poses(entries: Mapping[str, Any]) -> dict[str, Floats]:
     """World to camera by name; each relative pose after the one that it refers to."""
-    poses: dict[str, NDArray[np.float64]] = {}
+    poses: dict[str, Floats] = {}
     remaining = mapping(entries)
     while remaining:
         ready = {key: key.split("_to_") for key in remaining if "_to_" not in key or key.split("_to_")[1] in poses}
@@ -141,13 +137,12 @@ def _absolute_poses(entries: Mapping[str, Any]) -> dict[str, NDArray[np.float64]
     return poses
 
 
-def _multical_camera(name: str, entry: tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]) -> PosedCamera:
+def _multical_camera(name: str, entry: tuple[dict[str, Any], Mapping[str, Floats]]) -> PosedCamera:
     camera, poses = entry
     if name not in poses:
         raise NoPose
-    R, T = poses[name][:3, :3], poses[name][:3, 3]
-    fisheye = np.shape(camera["dist"]) == (4, 1)
-    return opencv_camera(name, K=camera["K"], dist=camera["dist"], R=R, T=T, size=camera["image_size"], fisheye=fisheye)
+    K, dist, size = camera["K"], camera["dist"], camera["image_size"]
+    return opencv_camera(name, poses[name], K=K, dist=dist, size=size, fisheye=np.shape(dist) == (4, 1))
 
 
 # Kalibr: camchain.yaml of pinholes with radtan or equidistant distortion. ``T_cn_cnm1`` maps the axes of the camera
@@ -198,8 +193,8 @@ def _kalibr_lens(name: str, camera: dict[str, Any], file: Path) -> Lens:
 
 def _cmu_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
     file_name = f"{entry['type']}_{name}/{name}"  # of a video, or of a folder
-    K, dist, R, T = (entry[key] for key in ("K", "distCoef", "R", "t"))
-    return opencv_camera(file_name, K=K, dist=dist, R=R, T=T, size=entry["resolution"], unit=CENTIMETRE)
+    viewmat = rigid(entry["R"], CENTIMETRE * np.array(entry["t"], np.float64))
+    return opencv_camera(file_name, viewmat, K=entry["K"], dist=entry["distCoef"], size=entry["resolution"])
 
 
 # ZJU-MoCap: annots.npy, in millimetres. ``cams`` has lists K, D, R and T; ``ims`` the pictures of each instant,
@@ -214,7 +209,7 @@ def _zju_entries(files: tuple[Path, ...]) -> Entries:
 
 def _zju_camera(name: str, row: list[Any]) -> PosedCamera:
     K, dist, R, T = row
-    return opencv_camera(name, K=K, dist=dist, R=R, T=T, unit=MILLIMETRE)
+    return opencv_camera(name, rigid(R, MILLIMETRE * np.array(T, np.float64)), K=K, dist=dist)
 
 
 # Qualisys: .qca.txt, XML in millimetres, lengths on the sensor in 1/64 pixel. ``transform`` maps the world to axes x
@@ -226,10 +221,7 @@ VIDEO_MODELS = ("video", "hybrid", "none")  # a hybrid camera films markers and 
 
 def _qualisys_entries(files: tuple[Path, ...]) -> Entries:
     (file,) = files
-    try:
-        cameras = ET.fromstring(file.read_bytes()).iter("camera")
-    except ET.ParseError as error:
-        raise Unreadable(f"it is not XML at line {error.position[0]}") from None
+    cameras = parsed_xml(file.read_bytes()).iter("camera")
     video = [tag for tag in cameras if any(word in tag.get("model", "none").lower() for word in VIDEO_MODELS)]
     entries = [(tag.attrib["serial"], tag) for tag in video]
     for serial, tag in entries:
@@ -304,7 +296,7 @@ def _projection_camera(name: str, matrix: ArrayLike) -> PosedCamera:
     return PosedCamera(name, viewmat, from_integer_centers(K), None)
 
 
-def decompose_projection(matrix: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def decompose_projection(matrix: ArrayLike) -> tuple[Floats, Floats]:
     """Intrinsics ``[3, 3]`` and world to camera ``[4, 4]`` of ``[3, 4]`` numbers, or of the first rows of ``[4, 4]``
     (Hartley and Zisserman, section 6.2.4)."""
     P = np.ravel(np.array(matrix, np.float64))
