@@ -18,10 +18,10 @@ from structgstream.codec.entropy.decisions import (
     code_residuals,
     residual_contexts,
 )
-from structgstream.codec.entropy.rans import has_native
+from structgstream.codec.entropy.rans import uses_native
 from tests.support.properties import examples
 
-NATIVE = [False, *([True] if has_native() else [])]
+NATIVE = [False, *([True] if uses_native() else [])]
 both = pytest.mark.parametrize("native", NATIVE)
 NUMBER = st.one_of(st.integers(-9, 9), st.integers(-(2**31) + 1, 2**31 - 1))
 
@@ -38,7 +38,7 @@ def contexts_for(values: list[int]) -> np.ndarray:
     return np.stack([places % 2, places % 3, 0 * places], axis=1)
 
 
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.skipif(not uses_native(), reason="the native library has no entropy coder")
 @examples(60)
 @given(st.lists(NUMBER, max_size=40), st.booleans())
 def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> None:
@@ -56,7 +56,7 @@ def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> 
         assert not code.is_overrun()
 
 
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.skipif(not uses_native(), reason="the native library has no entropy coder")
 @examples(25)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
 def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
