@@ -12,11 +12,9 @@ from structgstream.codec.segments.manifest import (
     PeriodEntry,
     SegmentEntry,
     Window,
-    init_name,
+    file_name,
     manifest_from_json,
     manifest_to_json,
-    part_name,
-    segment_name,
     sha256_of,
 )
 from structgstream.codec.segments.stored_bytes import paged, segments_from
@@ -52,10 +50,8 @@ class Memory:
 def segment(number: int, frames: int) -> SegmentEntry:
     sizes = (123_456, *[45_678] * (frames - 1))
     first = number * frames
-    return SegmentEntry(
-        number, segment_name(number, SHA), 0, first, frames, (first / 30, (first + frames - 1) / 30), sum(sizes),
-        sizes[0], sizes, SHA,
-    )  # fmt: skip
+    name, seconds = file_name("segment", number, SHA), (first / 30, (first + frames - 1) / 30)
+    return SegmentEntry(number, name, 0, first, frames, seconds, sum(sizes), sizes[0], sizes, SHA)
 
 
 def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
@@ -76,11 +72,11 @@ def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry
 def manifest(history: tuple[HistoryEntry, ...], listed: tuple[SegmentEntry, ...], frames: int) -> Manifest:
     first = listed[-1].first_frame + frames
     parts = tuple(
-        PartEntry(part_name(first + i, SHA), first + i, 0, kind, (first + i) / 30, 45_678, SHA)
+        PartEntry(file_name("part", first + i, SHA), first + i, 0, kind, (first + i) / 30, 45_678, SHA)
         for i, kind in enumerate((PacketKind.KEY, *[PacketKind.DELTA] * (frames - 1)))
     )
     edge = Edge(first + frames - 1, parts[-1].pts_seconds, 1.7e9, 1.7e9)
-    period = PeriodEntry(0, init_name(0, SHA), 800_000, SHA, 0, 0)
+    period = PeriodEntry(0, file_name("init", 0, SHA), 800_000, SHA, 0, 0)
     return Manifest(9, True, 30.0, "x", 2.0, 1.0, edge, Window(0, 0, None), (period,), history, listed, parts)
 
 

@@ -22,14 +22,11 @@ from structgstream.codec.segments.manifest import (
     PeriodEntry,
     SegmentEntry,
     Window,
-    history_name,
-    init_name,
+    file_name,
     manifest_from_json,
     manifest_to_json,
     page_from_json,
     page_to_json,
-    part_name,
-    segment_name,
     sha256_of,
 )
 from structgstream.errors import StreamError
@@ -44,7 +41,7 @@ def segment(number: int, frames: int = 3) -> SegmentEntry:
     """A segment of as many frames as each before it."""
     first = number * frames
     sizes = (100, *[10] * (frames - 1))
-    name = segment_name(number, SHA)
+    name = file_name("segment", number, SHA)
     return SegmentEntry(
         number, name, 0, first, frames, (first / 30, (first + frames - 1) / 30), sum(sizes), 100, sizes, SHA
     )
@@ -53,7 +50,7 @@ def segment(number: int, frames: int = 3) -> SegmentEntry:
 def manifest() -> Manifest:
     """One page of two segments, two segments, two parts."""
     page = page_to_json([segment(0), segment(1)])
-    name = history_name(0, sha256_of(page))
+    name = file_name("history", 0, sha256_of(page))
     return Manifest(
         sequence=12,
         live=True,
@@ -63,12 +60,12 @@ def manifest() -> Manifest:
         frame_seconds=None,
         edge=Edge(13, 13 / 30, None, 1.7e9 + 0.1),
         window=Window(0, 0, None),
-        periods=(PeriodEntry(0, init_name(0, SHA), 812_345, SHA, 0, 0),),
+        periods=(PeriodEntry(0, file_name("init", 0, SHA), 812_345, SHA, 0, 0),),
         history=(HistoryEntry(name, 0, 0, 2, 0, 6, (0.0, 5 / 30), len(page), sha256_of(page)),),
         segments=(segment(2), segment(3)),
         parts=(
-            PartEntry(part_name(12, SHA), 12, 0, PacketKind.KEY, 12 / 30, 90, SHA),
-            PartEntry(part_name(13, SHA), 13, 0, PacketKind.DELTA, 13 / 30, 9, SHA),
+            PartEntry(file_name("part", 12, SHA), 12, 0, PacketKind.KEY, 12 / 30, 90, SHA),
+            PartEntry(file_name("part", 13, SHA), 13, 0, PacketKind.DELTA, 13 / 30, 9, SHA),
         ),
     )
 

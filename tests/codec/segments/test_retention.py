@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, Window, segment_name
+from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, Window, file_name
 from structgstream.codec.segments.recovery import empty_manifest
 from structgstream.codec.segments.sink import Retention, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
@@ -20,7 +20,7 @@ SECOND = PeriodEntry(1, "init-0001-0123456789abcdef.sgs", 10, SHA, 12, 4)
 def segment(number: int) -> SegmentEntry:
     """Three frames, a second apart."""
     first = 3 * number
-    name = segment_name(number, SHA)
+    name = file_name("segment", number, SHA)
     return SegmentEntry(number, name, 0, first, 3, (float(first), first + 2.0), 30, 10, (10, 10, 10), SHA)
 
 

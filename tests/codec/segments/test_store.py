@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
+from structgstream.codec.segments.manifest import file_name
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
 
@@ -67,7 +67,8 @@ def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
 
 def test_names_of_the_sink_are_those_of_the_document_and_known() -> None:
     sixteen, digest = "0123456789abcdef", "0123456789abcdef" + "0" * 48
-    ours = [init_name(0, digest), part_name(12, digest), segment_name(123456789, digest), history_name(0, digest)]
+    given = (("init", 0), ("part", 12), ("segment", 123456789), ("history", 0))
+    ours = [file_name(kind, number, digest) for kind, number in given]
     assert ours[:2] == [f"init-0000-{sixteen}.sgs", f"part-00000012-{sixteen}.sgs"]
     assert ours[2:] == [f"segment-123456789-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
     assert all(map(is_ours, [*ours, "manifest.json"]))

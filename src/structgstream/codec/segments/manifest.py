@@ -11,10 +11,10 @@ are whole numbers, what is not RFC 8259 is refused also where nobody asks for it
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.errors import StreamError
@@ -24,6 +24,7 @@ MOST = 1e15
 
 _FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
+_HALF_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 class Fields:
@@ -39,30 +40,26 @@ class Fields:
             raise StreamError(f"{where} is {_shown(value)}; expected an object.")
         self._value: dict[str, Any] = value
 
-    def is_none(self, name: str) -> bool:
-        """Whether the field is there and null."""
-        return self._get(name) is None
-
     def whole(self, name: str, *, least: int = 0, most: int = 2**32 - 1) -> int:
         """A whole number."""
         return self._whole(name, self._get(name), least, most)
 
     def wholes(self, name: str, *, count: int, least: int = 0, most: int = 2**32 - 1) -> tuple[int, ...]:
         """A list of ``count`` whole numbers."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) != count:
-            self._refuse(name, values, f"a list of {count} whole numbers")
+        values = self._checked(name, lambda value: _is_list(value, count), f"a list of {count} whole numbers")
         return tuple(self._whole(name, value, least, most) for value in values)
 
     def number(self, name: str, *, least: float = -MOST) -> float:
         """A finite number."""
         return self._number(name, self._get(name), least)
 
+    def optional(self, name: str, *, least: float = -MOST) -> float | None:
+        """A finite number, or None for null."""
+        return None if self._get(name) is None else self.number(name, least=least)
+
     def pair(self, name: str) -> tuple[float, float]:
         """Two finite numbers that do not fall."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) != 2:
-            self._refuse(name, values, "two numbers")
+        values = self._checked(name, lambda value: _is_list(value, 2), "two numbers")
         first, last = (self._number(name, value, -MOST) for value in values)
         if first > last:
             self._refuse(name, values, "two numbers that do not fall")
@@ -70,37 +67,28 @@ class Fields:
 
     def text(self, name: str, *, most: int = 1000) -> str:
         """A text of at most ``most`` characters, which can be printed: JSON may hold halves of characters."""
-        value = self._get(name)
-        if not isinstance(value, str) or len(value) > most or any("\ud800" <= one <= "\udfff" for one in value):
-            self._refuse(name, value, f"a text of at most {most} characters")
-        return value
+
+        def fits(value: object) -> bool:
+            return isinstance(value, str) and len(value) <= most and not _HALF_CHARACTER.search(value)
+
+        return self._checked(name, fits, f"a text of at most {most} characters")
 
     def flag(self, name: str) -> bool:
         """True or false."""
-        value = self._get(name)
-        if not isinstance(value, bool):
-            self._refuse(name, value, "true or false")
-        return value
+        return self._checked(name, lambda value: isinstance(value, bool), "true or false")
 
     def file(self, name: str = "file") -> str:
         """The plain name of a file in the manifest's folder: no folder, no scheme, no leading dot."""
-        value = self._get(name)
-        if not isinstance(value, str) or not _FILE.fullmatch(value):
-            self._refuse(name, value, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")
-        return value
+        return self._matched(name, _FILE, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")
 
     def sha256(self, name: str = "sha256") -> str:
         """64 hex digits."""
-        value = self._get(name)
-        if not isinstance(value, str) or not _SHA256.fullmatch(value):
-            self._refuse(name, value, "64 hex digits")
-        return value
+        return self._matched(name, _SHA256, "64 hex digits")
 
     def items(self, name: str, *, most: int) -> "list[Fields]":
         """A list of at most ``most`` objects."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) > most:
-            self._refuse(name, values, f"a list of at most {most} objects")
+        expected = f"a list of at most {most} objects"
+        values = self._checked(name, lambda value: isinstance(value, list) and len(value) <= most, expected)
         return [Fields(value, f"{self._where}, {name}[{i}]") for i, value in enumerate(values)]
 
     def fields(self, name: str) -> "Fields":
@@ -116,19 +104,34 @@ class Fields:
             raise StreamError(f"{self._where} has no {name!r}.")
         return self._value[name]
 
+    def _checked(self, name: str, fits: Callable[[Any], bool], expected: str) -> Any:
+        if not fits(value := self._get(name)):
+            self._refuse(name, value, expected)
+        return value
+
+    def _matched(self, name: str, pattern: re.Pattern[str], expected: str) -> str:
+        return self._checked(name, lambda value: isinstance(value, str) and bool(pattern.fullmatch(value)), expected)
+
     def _whole(self, name: str, value: Any, least: int, most: int) -> int:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not least <= value <= most or value != int(value):
+        if not _is_number(value) or not least <= value <= most or value != int(value):
             self._refuse(name, value, f"a whole number from {least} to {most}")
         return int(value)
 
     def _number(self, name: str, value: Any, least: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= MOST:
+        if not _is_number(value) or not least <= value <= MOST:
             self._refuse(name, value, f"a number from {least:g} to {MOST:g}")
         return float(value)
 
     def _refuse(self, name: str, value: object, expected: str) -> NoReturn:
         raise StreamError(f"{self._where} has {name!r} {_shown(value)}; expected {expected}.")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_list(value: object, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count
 
 
 def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
@@ -140,6 +143,17 @@ def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
     except (ValueError, RecursionError) as error:
         raise StreamError(f"{where} is not JSON ({error}).") from None
     return Fields(value, where)
+
+
+def parse_document(data: bytes, name: str, *, max_bytes: int, what: str, format: str, version: int) -> Fields:
+    """The JSON object in ``data``, ``what`` of a format and version. Raises StreamError if it is of another format or
+    version, or as :func:`parse_object`."""
+    top = parse_object(data, name, max_bytes=max_bytes)
+    if (found := top.text("format")) != format:
+        raise StreamError(f"{name} is no {what}: its format is {found!r}; expected {format!r}.")
+    if (found := top.whole("version")) != version:
+        raise StreamError(f"{name} has version {found}; this program reads {version}. Install a newer structgstream.")
+    return top
 
 
 def _number(text: str) -> int | float:
@@ -284,24 +298,11 @@ def sha256_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def init_name(period: int, sha256: str) -> str:
-    """The name of a period's init record."""
-    return f"init-{period:04d}-{sha256[:16]}.sgs"
-
-
-def part_name(frame: int, sha256: str) -> str:
-    """The name of a frame of the group being written."""
-    return f"part-{frame:08d}-{sha256[:16]}.sgs"
-
-
-def segment_name(segment: int, sha256: str) -> str:
-    """The name of a segment."""
-    return f"segment-{segment:08d}-{sha256[:16]}.sgs"
-
-
-def history_name(first_segment: int, sha256: str) -> str:
-    """The name of a page whose first segment has this number."""
-    return f"history-{first_segment:08d}-{sha256[:16]}.json"
+def file_name(kind: Literal["init", "part", "segment", "history"], number: int, sha256: str) -> str:
+    """The name of a file: of the init record of a period, of a frame of the group being written, of a segment, or of a
+    page whose first segment has this number."""
+    digits, suffix = 4 if kind == "init" else 8, "json" if kind == "history" else "sgs"
+    return f"{kind}-{number:0{digits}d}-{sha256[:16]}.{suffix}"
 
 
 MAX_MANIFEST_BYTES = 4 * 2**20
@@ -322,11 +323,8 @@ def manifest_to_json(manifest: Manifest) -> bytes:
 def manifest_from_json(data: bytes, *, name: str) -> Manifest:
     """The manifest in ``data``; ``name`` is for messages. Raises StreamError if it is no manifest, of a newer version,
     or contradicts itself or the format's bounds."""
-    top = parse_object(data, name, max_bytes=MAX_MANIFEST_BYTES)
-    if (found := top.text("format")) != FORMAT:
-        raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
-    if (version := top.whole("version")) != VERSION:
-        raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
+    what = "manifest of segments"
+    top = parse_document(data, name, max_bytes=MAX_MANIFEST_BYTES, what=what, format=FORMAT, version=VERSION)
     edge, window = top.fields("edge"), top.fields("window")
     manifest = Manifest(
         sequence=top.whole("sequence", most=2**53 - 1),
@@ -334,14 +332,14 @@ def manifest_from_json(data: bytes, *, name: str) -> Manifest:
         fps=top.number("fps", least=MIN_FPS),
         name=top.text("name"),
         target_latency_seconds=top.number("target_latency_seconds", least=0.0),
-        frame_seconds=None if top.is_none("frame_seconds") else top.number("frame_seconds", least=0.0),
+        frame_seconds=top.optional("frame_seconds", least=0.0),
         edge=Edge(
             frame=edge.whole("frame"),
             pts_seconds=edge.number("pts_seconds"),
-            captured_unix_seconds=_optional(edge, "captured_unix_seconds"),
+            captured_unix_seconds=edge.optional("captured_unix_seconds"),
             published_unix_seconds=edge.number("published_unix_seconds"),
         ),
-        window=Window(window.whole("first_frame"), window.whole("first_segment"), _optional(window, "seconds")),
+        window=Window(window.whole("first_frame"), window.whole("first_segment"), window.optional("seconds")),
         periods=tuple(_period(entry) for entry in top.items("periods", most=MAX_ENTRIES)),
         history=tuple(_page(entry) for entry in top.items("history", most=MAX_ENTRIES)),
         segments=tuple(_segment(entry) for entry in top.items("segments", most=MAX_ENTRIES)),
@@ -379,10 +377,6 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
 
 def _dumped(value: dict[str, Any]) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
-def _optional(fields: Fields, name: str) -> float | None:
-    return None if fields.is_none(name) else fields.number(name)
 
 
 def _period(fields: Fields) -> PeriodEntry:
