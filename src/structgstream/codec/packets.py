@@ -5,6 +5,7 @@ with the shapes that fit together (docs/bitstream.md, Init record, Fields)."""
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,9 +16,8 @@ from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.container.blocks import (
     first_block,
     iterate_blocks,
-    pack_coded_block,
+    pack_blocks,
     pack_init,
-    pack_raw_block,
     read_description,
     unpack_blocks,
 )
@@ -221,15 +221,12 @@ def pack_header(header: StreamHeader) -> bytes:
     description = {
         "cameras": [
             {
+                **values,
                 "name": name,
                 "viewmat": header.rig[name].viewmat.flatten().tolist(),
                 "K": header.rig[name].K.flatten().tolist(),
-                "width": header.rig[name].width,
-                "height": header.rig[name].height,
-                "near": header.rig[name].near,
-                "held_out": name in header.rig.held_out,
             }
-            for name in header.rig
+            for name, values in header.rig.plain().items()
         ],
         "similarity": {"center": list(header.similarity.center), "scale": header.similarity.scale},
         "fps": header.fps,
@@ -245,13 +242,8 @@ def pack_header(header: StreamHeader) -> bytes:
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
-    blocks = [
-        pack_coded_block(f.name, coded[f.name]) if f.name in coded else pack_raw_block(f.name, part[f.name])
-        for part in (header.static, header.reference)
-        for f in STATE_TABLE
-        if f.name in part
-    ]
-    return pack_init(description, blocks)
+    blocks = (pack_blocks(part, coded).values() for part in (header.static, header.reference))
+    return pack_init(description, chain(*blocks))
 
 
 def check_picture_sizes(rig: CameraRig) -> None:
