@@ -13,12 +13,14 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache, partial
 from itertools import pairwise
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_type_hints
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.errors import StreamError
 
+Value = TypeVar("Value")
 MOST = 1e15
 """The largest number where nothing else is stated; whole numbers up to it are exact in a double."""
 
@@ -186,51 +188,109 @@ LISTED_SEGMENTS = 8
 """The newest segments are always listed in the manifest itself."""
 
 
+MAX_MANIFEST_BYTES = 4 * 2**20
+MAX_PAGE_BYTES = 4 * 2**20
+MAX_ENTRIES = 4096
+MAX_GROUP_FRAMES = 65_536
+MAX_SEGMENT_BYTES = 2**40
+MAX_FRAME_BYTES = 2**33
+MAX_LEVEL = 8
+MIN_FPS = 1e-9
+
+# A field of the values below is annotated with its reader, which also checks its bounds.
+Whole = Annotated[int, Fields.whole]
+Count = Annotated[int, partial(Fields.whole, least=1)]
+FrameCount = Annotated[int, partial(Fields.whole, least=1, most=MAX_GROUP_FRAMES)]
+FrameBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_FRAME_BYTES)]
+SegmentBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_SEGMENT_BYTES)]
+PageBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_PAGE_BYTES)]
+Number = Annotated[float, Fields.number]
+Pair = Annotated[tuple[float, float], Fields.pair]
+NumberOrNone = Annotated[float | None, Fields.optional]
+FileName = Annotated[str, Fields.file]
+Sha256 = Annotated[str, Fields.sha256]
+
+
+@cache
+def _readers(kind: type) -> dict[str, Callable[[Fields, str], Any]]:
+    return {name: hint.__metadata__[0] for name, hint in get_type_hints(kind, include_extras=True).items()}
+
+
+def _read(kind: type[Value], fields: Fields) -> Value:
+    """The value with the fields of an object."""
+    return kind(**{name: reader(fields, name) for name, reader in _readers(kind).items()})
+
+
+def _object(fields: Fields, name: str, *, kind: type[Value]) -> Value:
+    return _read(kind, fields.fields(name))
+
+
+def _list(fields: Fields, name: str, *, kind: type[Value], most: int = MAX_ENTRIES) -> tuple[Value, ...]:
+    return tuple(_read(kind, one) for one in fields.items(name, most=most))
+
+
+def _frame_bytes(fields: Fields, name: str) -> tuple[int, ...]:
+    count = fields.whole("frames", least=1, most=MAX_GROUP_FRAMES)
+    found = fields.wholes(name, count=count, least=1, most=MAX_FRAME_BYTES)
+    if sum(found) != fields.whole("bytes", most=MAX_SEGMENT_BYTES) or found[0] != fields.whole(
+        "key_bytes", most=MAX_FRAME_BYTES
+    ):
+        fields.refuse("states lengths of frames that are not those of the segment")
+    return found
+
+
+def _kind(fields: Fields, name: str) -> PacketKind:
+    kinds = {kind.name.lower(): kind for kind in PacketKind}
+    if (kind := fields.text(name, most=20)) not in kinds:
+        fields.refuse(f"has {name!r} {kind!r}; expected {' or '.join(kinds)}")
+    return kinds[kind]
+
+
 @dataclass(frozen=True)
 class Edge:
     """The newest frame."""
 
-    frame: int  # its number
-    pts_seconds: float  # its presentation time
-    captured_unix_seconds: float | None  # when it was filmed; None if that is not known
-    published_unix_seconds: float  # when it was written, by the writer's clock
+    frame: Whole  # its number
+    pts_seconds: Number  # its presentation time
+    captured_unix_seconds: NumberOrNone  # when it was filmed; None if that is not known
+    published_unix_seconds: Number  # when it was written, by the writer's clock
 
 
 @dataclass(frozen=True)
 class Window:
     """What is still there: everything from ``first_frame`` on. ``seconds`` is None if nothing is ever removed."""
 
-    first_frame: int
-    first_segment: int
-    seconds: float | None
+    first_frame: Whole
+    first_segment: Whole
+    seconds: NumberOrNone
 
 
 @dataclass(frozen=True)
 class PeriodEntry:
     """The init record of a period, and where the period begins."""
 
-    period: int
-    file: str
-    bytes: int
-    sha256: str
-    first_frame: int
-    first_segment: int
+    period: Whole
+    file: FileName
+    bytes: SegmentBytes
+    sha256: Sha256
+    first_frame: Whole
+    first_segment: Whole
 
 
 @dataclass(frozen=True)
 class SegmentEntry:
     """A whole group of frames."""
 
-    segment: int  # its number
-    file: str  # its name
-    period: int  # number of the period whose init record it needs
-    first_frame: int  # number of its key frame
-    frames: int  # how many
-    pts_seconds: tuple[float, float]  # presentation times of its first and last frame
-    bytes: int  # its length
-    key_bytes: int  # length of its prefix with which its first frame can be shown
-    frame_bytes: tuple[int, ...]  # length of each frame's records, in order
-    sha256: str  # of its content
+    segment: Whole  # its number
+    file: FileName  # its name
+    period: Whole  # number of the period whose init record it needs
+    first_frame: Whole  # number of its key frame
+    frames: FrameCount  # how many
+    pts_seconds: Pair  # presentation times of its first and last frame
+    bytes: SegmentBytes  # its length
+    key_bytes: FrameBytes  # length of its prefix with which its first frame can be shown
+    frame_bytes: Annotated[tuple[int, ...], _frame_bytes]  # length of each frame's records, in order
+    sha256: Sha256  # of its content
     segments = 1  # as of a page
 
     @property
@@ -243,28 +303,29 @@ class SegmentEntry:
 class HistoryEntry:
     """A page of older segments."""
 
-    file: str  # its name
-    level: int  # 0 if the page lists segments, otherwise it lists pages of the level below
-    first_segment: int  # number of the first segment of the page
-    segments: int  # number of segments in all
-    first_frame: int  # number of the first frame
-    frames: int  # number of frames in all
-    pts_seconds: tuple[float, float]  # presentation times of the first and the last frame
-    bytes: int  # length of the page
-    sha256: str  # of the page
+    file: FileName  # its name
+    # 0 if the page lists segments, otherwise it lists pages of the level below
+    level: Annotated[int, partial(Fields.whole, most=MAX_LEVEL)]
+    first_segment: Whole  # number of the first segment of the page
+    segments: Count  # number of segments in all
+    first_frame: Whole  # number of the first frame
+    frames: Count  # number of frames in all
+    pts_seconds: Pair  # presentation times of the first and the last frame
+    bytes: PageBytes  # length of the page
+    sha256: Sha256  # of the page
 
 
 @dataclass(frozen=True)
 class PartEntry:
     """One frame of the group that is being written."""
 
-    file: str
-    frame: int
-    period: int
-    kind: PacketKind
-    pts_seconds: float
-    bytes: int
-    sha256: str
+    file: FileName
+    frame: Whole
+    period: Whole
+    kind: Annotated[PacketKind, _kind]
+    pts_seconds: Number
+    bytes: FrameBytes
+    sha256: Sha256
 
 
 StoredFile = PeriodEntry | SegmentEntry | HistoryEntry | PartEntry
@@ -274,18 +335,22 @@ StoredFile = PeriodEntry | SegmentEntry | HistoryEntry | PartEntry
 class Manifest:
     """A stream at one moment: pages, then segments, then parts follow each other without gaps."""
 
-    sequence: int  # rises by one with every rewriting
-    live: bool  # False once the run has finished or was stopped
-    fps: float  # of the media
-    name: str  # of the capture
-    target_latency_seconds: float  # how far a player should keep behind the edge
-    frame_seconds: float | None  # mean wall-clock seconds from frame to frame of late; None before the second
-    edge: Edge  # the newest frame
-    window: Window  # what is still there
-    periods: tuple[PeriodEntry, ...]  # of what is listed, the last one is the running one
-    history: tuple[HistoryEntry, ...]  # pages, oldest first
-    segments: tuple[SegmentEntry, ...]  # the newest ones
-    parts: tuple[PartEntry, ...]  # of the group being written, none when live is False
+    sequence: Annotated[int, partial(Fields.whole, most=2**53 - 1)]  # rises by one with every rewriting
+    live: Annotated[bool, Fields.flag]  # False once the run has finished or was stopped
+    fps: Annotated[float, partial(Fields.number, least=MIN_FPS)]  # of the media
+    name: Annotated[str, Fields.text]  # of the capture
+    # how far a player should keep behind the edge
+    target_latency_seconds: Annotated[float, partial(Fields.number, least=0.0)]
+    # mean wall-clock seconds from frame to frame of late; None before the second
+    frame_seconds: Annotated[float | None, partial(Fields.optional, least=0.0)]
+    edge: Annotated[Edge, partial(_object, kind=Edge)]  # the newest frame
+    window: Annotated[Window, partial(_object, kind=Window)]  # what is still there
+    # of what is listed, the last one is the running one
+    periods: Annotated[tuple[PeriodEntry, ...], partial(_list, kind=PeriodEntry)]
+    history: Annotated[tuple[HistoryEntry, ...], partial(_list, kind=HistoryEntry)]  # pages, oldest first
+    segments: Annotated[tuple[SegmentEntry, ...], partial(_list, kind=SegmentEntry)]  # the newest ones
+    # of the group being written, none when live is False
+    parts: Annotated[tuple[PartEntry, ...], partial(_list, kind=PartEntry, most=MAX_GROUP_FRAMES)]
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -305,15 +370,6 @@ def file_name(kind: Literal["init", "part", "segment", "history"], number: int, 
     return f"{kind}-{number:0{digits}d}-{sha256[:16]}.{suffix}"
 
 
-MAX_MANIFEST_BYTES = 4 * 2**20
-MAX_PAGE_BYTES = 4 * 2**20
-MAX_ENTRIES = 4096
-MAX_GROUP_FRAMES = 65_536
-MAX_SEGMENT_BYTES = 2**40
-MAX_LEVEL = 8
-MIN_FPS = 1e-9
-
-
 def manifest_to_json(manifest: Manifest) -> bytes:
     """The content of ``manifest.json``."""
     parts = [{**asdict(part), "kind": part.kind.name.lower()} for part in manifest.parts]
@@ -325,26 +381,7 @@ def manifest_from_json(data: bytes, *, name: str) -> Manifest:
     or contradicts itself or the format's bounds."""
     what = "manifest of segments"
     top = parse_document(data, name, max_bytes=MAX_MANIFEST_BYTES, what=what, format=FORMAT, version=VERSION)
-    edge, window = top.fields("edge"), top.fields("window")
-    manifest = Manifest(
-        sequence=top.whole("sequence", most=2**53 - 1),
-        live=top.flag("live"),
-        fps=top.number("fps", least=MIN_FPS),
-        name=top.text("name"),
-        target_latency_seconds=top.number("target_latency_seconds", least=0.0),
-        frame_seconds=top.optional("frame_seconds", least=0.0),
-        edge=Edge(
-            frame=edge.whole("frame"),
-            pts_seconds=edge.number("pts_seconds"),
-            captured_unix_seconds=edge.optional("captured_unix_seconds"),
-            published_unix_seconds=edge.number("published_unix_seconds"),
-        ),
-        window=Window(window.whole("first_frame"), window.whole("first_segment"), window.optional("seconds")),
-        periods=tuple(_period(entry) for entry in top.items("periods", most=MAX_ENTRIES)),
-        history=tuple(_page(entry) for entry in top.items("history", most=MAX_ENTRIES)),
-        segments=tuple(_segment(entry) for entry in top.items("segments", most=MAX_ENTRIES)),
-        parts=tuple(_part(entry) for entry in top.items("parts", most=MAX_GROUP_FRAMES)),
-    )
+    manifest = _read(Manifest, top)
     _check(manifest, name)
     return manifest
 
@@ -363,11 +400,11 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
         top.refuse(f"is no history page of {FORMAT} {VERSION}")
     found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]
     if entry.level:
-        found = tuple(_page(one) for one in top.items("history", most=MAX_ENTRIES))
+        found = _list(top, "history", kind=HistoryEntry)
         if any(page.level != entry.level - 1 for page in found):
             top.refuse(f"lists pages of other levels than {entry.level - 1}")
     else:
-        found = tuple(_segment(one) for one in top.items("segments", most=MAX_ENTRIES))
+        found = _list(top, "segments", kind=SegmentEntry)
     _check_run(found, entry.first_segment, entry.first_frame, entry.file)
     counts = sum(one.segments for one in found), sum(one.frames for one in found)
     if counts != (entry.segments, entry.frames):
@@ -377,65 +414,6 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
 
 def _dumped(value: dict[str, Any]) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
-def _period(fields: Fields) -> PeriodEntry:
-    return PeriodEntry(
-        period=fields.whole("period"),
-        file=fields.file(),
-        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
-        sha256=fields.sha256(),
-        first_frame=fields.whole("first_frame"),
-        first_segment=fields.whole("first_segment"),
-    )
-
-
-def _page(fields: Fields) -> HistoryEntry:
-    return HistoryEntry(
-        file=fields.file(),
-        level=fields.whole("level", most=MAX_LEVEL),
-        first_segment=fields.whole("first_segment"),
-        segments=fields.whole("segments", least=1),
-        first_frame=fields.whole("first_frame"),
-        frames=fields.whole("frames", least=1),
-        pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MAX_PAGE_BYTES),
-        sha256=fields.sha256(),
-    )
-
-
-def _segment(fields: Fields) -> SegmentEntry:
-    frames = fields.whole("frames", least=1, most=MAX_GROUP_FRAMES)
-    entry = SegmentEntry(
-        segment=fields.whole("segment"),
-        file=fields.file(),
-        period=fields.whole("period"),
-        first_frame=fields.whole("first_frame"),
-        frames=frames,
-        pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
-        key_bytes=fields.whole("key_bytes", least=1, most=2**33),
-        frame_bytes=fields.wholes("frame_bytes", count=frames, least=1, most=2**33),
-        sha256=fields.sha256(),
-    )
-    if sum(entry.frame_bytes) != entry.bytes or entry.key_bytes != entry.frame_bytes[0]:
-        fields.refuse("states lengths of frames that are not those of the segment")
-    return entry
-
-
-def _part(fields: Fields) -> PartEntry:
-    kinds = {kind.name.lower(): kind for kind in PacketKind}
-    if (kind := fields.text("kind", most=20)) not in kinds:
-        fields.refuse(f"has 'kind' {kind!r}; expected {' or '.join(kinds)}")
-    return PartEntry(
-        file=fields.file(),
-        frame=fields.whole("frame"),
-        period=fields.whole("period"),
-        kind=kinds[kind],
-        pts_seconds=fields.number("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=2**33),
-        sha256=fields.sha256(),
-    )
 
 
 def _check(manifest: Manifest, name: str) -> None:
