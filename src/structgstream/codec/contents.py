@@ -237,14 +237,12 @@ class Packets(Sequence[PacketInfo]):
 
 
 class PeriodTable:
-    """The periods of one stream, the first of which is always there. One header besides the first is in memory.
+    """The periods of one stream, the first of which is always there. One header besides the first is in memory. Raises
+    StreamError if the first init record is not valid.
 
     Attributes:
         first: the header of the first period.
         periods: those of which a packet has been found, in order; always the first.
-
-    Raises:
-        StreamError: the init record is not valid.
     """
 
     def __init__(self, data: ByteSource, name: str, init: Record) -> None:

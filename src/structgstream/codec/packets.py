@@ -160,11 +160,8 @@ ENVIRONMENT_ROWS = (1, 4, 9)
 def check_shapes(
     fields: Mapping[FieldName, Tensor], *, distance_input: bool, training_cameras: int, where: str
 ) -> None:
-    """Check that the shapes of the fields present are consistent.
-
-    Raises:
-        StreamError: naming the first field of another shape, its shape and the expected one.
-    """
+    """Check that the shapes of the fields present are consistent. Raises StreamError that names the first field of
+    another shape, its shape and the expected one."""
     sizes: dict[str, int] = {"V": training_cameras}
     for name, value in fields.items():
         _match(name, value, sizes, where)

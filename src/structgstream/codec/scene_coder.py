@@ -50,12 +50,8 @@ class CompactState:
 
 
 class CompactCoder:
-    """Encodes or decodes the frames of one stream in order; decoding may start at any key packet.
-
-    Raises:
-        StreamError: the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or
-            reference for one.
-    """
+    """Encodes or decodes the frames of one stream in order; decoding may start at any key packet. Raises StreamError if
+    the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or reference for one."""
 
     def __init__(self, header: StreamHeader) -> None:
         check_codec(header.codec)
@@ -121,10 +117,8 @@ class CompactCoder:
 class SceneDecoder:
     """Decodes the packets of one stream, in order: a delta packet follows the packet before it.
 
-    Key packets, and with the ``raw`` codec all packets, can be decoded without the one before.
-
-    Raises:
-        StreamError: the codec is unknown to this version, or the header is inconsistent with it.
+    Key packets, and with the ``raw`` codec all packets, can be decoded without the one before. Raises StreamError if
+    the codec is unknown to this version, or the header is inconsistent with it.
     """
 
     def __init__(self, header: StreamHeader) -> None:

@@ -132,12 +132,10 @@ class _RecordSink:
 
 
 def readable_part(data: ByteSource, *, name: str) -> int | None:
-    """End of the last whole packet, before the index; None if there is no whole packet.
+    """End of the last whole packet, before the index; None if there is no whole packet. Raises StreamError if it is no
+    stream, of another major version, or damaged before whole frames, which writing would destroy.
 
     In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
-
-    Raises:
-        StreamError: not a stream, another major version, or damage before whole frames, which writing would destroy.
     """
     if may_be_prefix(data[: PREFIX.size + 1]):
         return None  # Cut within the prefix, or empty.
@@ -232,11 +230,7 @@ class FileSink(_RecordSink):
         return super().open(header)
 
     def close(self) -> None:
-        """Write the index, unless a write has failed, and close the file. A second call does nothing.
-
-        Raises:
-            StorageError: no room for the index; all frames are safe.
-        """
+        """As of every sink; the file is closed in any case."""
         with self._file or nullcontext():
             super().close()
 
@@ -323,14 +317,9 @@ class StoredSegments(StreamReader):
 def resume_segments(
     store: Store, *, options: SegmentsOptions | None = None, clocks: Clocks | None = None
 ) -> tuple[SegmentsSink, StoredSegments | None]:
-    """A sink that continues a stream of segments after its last written frame, and its existing frames.
-
-    They are None if there is no whole frame: the stream then begins again. Nothing is changed before the sink is
-    opened.
-
-    Raises:
-        StreamError: the stream is damaged so that it cannot be continued.
-    """
+    """A sink that continues a stream of segments after its last written frame, and its existing frames; None if there
+    is no whole one: the stream then begins again. Nothing is changed before the sink is opened. Raises StreamError if
+    the stream is damaged so that it cannot be continued."""
     found = find(store)
     sink = SegmentsSink(store, overwrite=True, options=options, clocks=clocks, found=found)
     if found is None:

@@ -13,7 +13,7 @@ from structgstream.codec.segments.recovery import find, part_of, stale_files
 from structgstream.codec.segments.store import FolderStore
 from structgstream.errors import StreamError
 from tests.support.segment_folders import GrowingFolder
-from tests.support.streams import small_stream
+from tests.support.streams import flipped, small_stream
 
 STREAM = small_stream(8)
 
@@ -39,9 +39,8 @@ class Left:
         self.last = growing.manifest
 
     def flip(self, name: str) -> None:
-        data = bytearray(self.store.get(name))
-        data[-5] ^= 1
-        self.store.put(name, bytes(data))
+        data = self.store.get(name)
+        self.store.put(name, flipped(data, 8 * (len(data) - 5)))
 
     def found(self) -> Manifest:
         draft = find(self.store)

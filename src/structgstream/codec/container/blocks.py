@@ -101,11 +101,8 @@ def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[B
 def unpack_blocks(
     payload: bytes, start: int, *, where: str
 ) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
-    """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end.
-
-    Raises:
-        StreamError: as :func:`iterate_blocks`.
-    """
+    """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end. Raises
+    StreamError as :func:`iterate_blocks`."""
     values: dict[FieldName, Tensor] = {}
     coded: dict[FieldName, memoryview] = {}
     for block in iterate_blocks(payload, start, where=where):

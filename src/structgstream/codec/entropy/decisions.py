@@ -230,10 +230,6 @@ class _Coder:
         self._low = (self._low << 8 | byte) & 0xFFFFFFFF
         self._place += 1
 
-    def even(self, yes: int) -> int:
-        """Codes a decision of probability one half."""
-        return self._decide(yes, HALF)
-
     def _decide(self, yes: int, chance: int) -> int:
         bound = (self._range >> 16) * chance
         if not self._encodes:
@@ -288,7 +284,7 @@ class _Coder:
                 length += 1
             found = 1
             for bit in range(length - 1, -1, -1):
-                found = found << 1 | self.even(rest >> bit & 1 if rest > 0 else 0)
+                found = found << 1 | self._decide(rest >> bit & 1 if rest > 0 else 0, HALF)
             size = found + NEAR_SIZES
         return -size if negative else size
 

@@ -141,9 +141,8 @@ def reopened(draft: Draft, store: Store) -> Draft:
 
 def next_segment(manifest: Manifest) -> int:
     """Number of the segment after the last one."""
-    if manifest.segments:
-        return manifest.segments[-1].segment + 1
-    return manifest.history[-1].first_segment + manifest.history[-1].segments if manifest.history else 0
+    last = [*manifest.history, *manifest.segments][-1:]
+    return last[0].first_segment + last[0].segments if last else 0
 
 
 def running_period(manifest: Manifest) -> PeriodEntry:
@@ -183,13 +182,9 @@ _NAME = re.compile(r"(init|part|segment|history)-(\d+)-([0-9a-f]{16})\.")
 
 
 def find(store: Store) -> Draft | None:
-    """The stream in a store with every frame that was written, to go on after it.
-
-    None if there is no whole frame: the stream then begins again. Nothing is changed.
-
-    Raises:
-        StreamError: the store cannot be read, or what is there is damaged so that it cannot be continued.
-    """
+    """The stream in a store with every frame that was written, to go on after it; None if there is no whole frame: the
+    stream then begins again. Nothing is changed. Raises StreamError if the store cannot be read, or what is there is
+    damaged so that it cannot be continued."""
     there = store.names()
     draft = _named(store, there) if MANIFEST in there else _unnamed(store, there)
     if draft is None:

@@ -17,14 +17,7 @@ from dataclasses import dataclass, replace
 from structgstream.codec.container.byte_source import check_room
 from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, sound_record
-from structgstream.codec.segments.manifest import (
-    MANIFEST,
-    Edge,
-    Manifest,
-    SegmentEntry,
-    Window,
-    manifest_to_json,
-)
+from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, SegmentEntry, Window, manifest_to_json
 from structgstream.codec.segments.recovery import (
     Draft,
     empty_manifest,
@@ -215,10 +208,7 @@ class SegmentsSink:
 
     def close(self) -> None:
         """Finish the group as a segment and say in the manifest that the run has ended. A second call does nothing.
-
-        Raises:
-            StorageError: no room; all frames are safe.
-        """
+        Raises StorageError if there is no room; all frames are safe."""
         draft = self._draft
         try:
             if draft is None or draft.manifest.edge.frame < 0:
