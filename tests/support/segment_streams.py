@@ -7,10 +7,14 @@ from pathlib import Path
 
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder
+from structgstream.codec.segments.manifest import SegmentEntry, file_name, sha256_of
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
 from tests.support.streams import header_for, moved, small_scene
+
+SHA256 = sha256_of(b"")
+"""What entries of files state whose content does not matter."""
 
 
 class Killed(BaseException):
@@ -30,6 +34,15 @@ def packets(frames: int, *, group: int = 3) -> list[Packet]:
     return [
         encoder.encode(scene, index=i, pts_seconds=i / 30.0, kind=kinds[i]).packet for i, scene in enumerate(scenes)
     ]
+
+
+def segment_entry(
+    number: int, *, frames: int = 3, sizes: tuple[int, int] = (100, 10), fps: float = 30.0
+) -> SegmentEntry:
+    """A segment of as many frames as each before it, of these sizes of key and delta packets."""
+    first, all_sizes = number * frames, (sizes[0], *[sizes[1]] * (frames - 1))
+    name, seconds = file_name("segment", number, SHA256), (first / fps, (first + frames - 1) / fps)
+    return SegmentEntry(number, name, 0, first, frames, seconds, sum(all_sizes), sizes[0], all_sizes, SHA256)
 
 
 def as_file(sent: Sequence[Packet]) -> bytes:

@@ -15,12 +15,10 @@ from structgstream.codec.segments.manifest import (
     file_name,
     manifest_from_json,
     manifest_to_json,
-    sha256_of,
 )
 from structgstream.codec.segments.stored_bytes import paged, segments_from
 from structgstream.errors import StreamError
-
-SHA = sha256_of(b"")
+from tests.support.segment_streams import SHA256, segment_entry
 
 
 class Memory:
@@ -47,20 +45,13 @@ class Memory:
         return None
 
 
-def segment(number: int, frames: int) -> SegmentEntry:
-    sizes = (123_456, *[45_678] * (frames - 1))
-    first = number * frames
-    name, seconds = file_name("segment", number, SHA), (first / 30, (first + frames - 1) / 30)
-    return SegmentEntry(number, name, 0, first, frames, seconds, sum(sizes), sizes[0], sizes, SHA)
-
-
 def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
     """History and segments after as many groups, and the longest that both together were as JSON."""
     history: tuple[HistoryEntry, ...] = ()
     listed: tuple[SegmentEntry, ...] = ()
     longest = 0
     for number in range(segments):
-        found = paged(history, (*listed, segment(number, frames)))
+        found = paged(history, (*listed, segment_entry(number, frames=frames, sizes=(123_456, 45_678))))
         for name, data in found.pages:
             store.put(name, data)
         history, listed = found.history, found.segments
@@ -72,11 +63,11 @@ def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry
 def manifest(history: tuple[HistoryEntry, ...], listed: tuple[SegmentEntry, ...], frames: int) -> Manifest:
     first = listed[-1].first_frame + frames
     parts = tuple(
-        PartEntry(file_name("part", first + i, SHA), first + i, 0, kind, (first + i) / 30, 45_678, SHA)
+        PartEntry(file_name("part", first + i, SHA256), first + i, 0, kind, (first + i) / 30, 45_678, SHA256)
         for i, kind in enumerate((PacketKind.KEY, *[PacketKind.DELTA] * (frames - 1)))
     )
     edge = Edge(first + frames - 1, parts[-1].pts_seconds, 1.7e9, 1.7e9)
-    period = PeriodEntry(0, file_name("init", 0, SHA), 800_000, SHA, 0, 0)
+    period = PeriodEntry(0, file_name("init", 0, SHA256), 800_000, SHA256, 0, 0)
     return Manifest(9, True, 30.0, "x", 2.0, 1.0, edge, Window(0, 0, None), (period,), history, listed, parts)
 
 
