@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of segments that several tests write, and stores that fail."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.segments.manifest import SegmentEntry, file_name, sha256_of
-from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.sink import Clocks, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
-from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
+from structgstream.codec.sinks import MemorySink, resume_segments
 from tests.support.streams import header_for, moved, small_scene
 
 SHA256 = sha256_of(b"")
@@ -78,28 +78,21 @@ def written(
     *,
     options: SegmentsOptions | None = None,
     hands: Hands | None = None,
-    seconds: float = 1.0,
     after: Callable[[int], object] = lambda frame: None,
+    periods: Mapping[int, StreamHeader] | None = None,
 ) -> None:
-    """Write a stream, or what is missing of one, as a session does; ``seconds`` pass with every frame."""
-    hands = hands or Hands()
+    """Write a stream, or what is missing of one, as a session does; a second passes with every frame. ``periods`` are
+    headers by first frame, if there are several."""
+    hands, periods = hands or Hands(), periods or {0: header()}
     sink, resumed = resume_segments(store, options=options, clocks=hands.clocks())
-    _write(sink, sent[0 if resumed is None else len(resumed) :], resumed, hands, seconds, after)
-
-
-def _write(
-    sink: SegmentsSink,
-    sent: Sequence[Packet],
-    resumed: StoredSegments | None,
-    hands: Hands,
-    seconds: float,
-    after: Callable[[int], object],
-) -> None:
-    if resumed is not None and resumed.complete and not sent:
+    start = 0 if resumed is None else len(resumed)
+    if resumed is not None and resumed.complete and start == len(sent):
         return
-    sink.open(header() if resumed is None else resumed.header)
-    for packet in sent:
-        hands.wait(seconds)
+    sink.open(periods[0] if resumed is None else resumed.header_of(start - 1))
+    for packet in sent[start:]:
+        hands.wait(1.0)
+        if packet.index and packet.index in periods:
+            sink.begin(periods[packet.index])
         sink.write(packet)
         after(packet.index)
     sink.close()

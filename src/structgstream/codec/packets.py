@@ -3,7 +3,7 @@
 with the shapes that fit together (docs/bitstream.md, Init record, Fields)."""
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Protocol
@@ -119,7 +119,6 @@ class PacketSink(Protocol):
 
     def begin(self, header: StreamHeader) -> int:
         """Begin another period with the next packet, a key packet; returns the bytes of its init record."""
-        ...
 
     def write(self, packet: Packet) -> int: ...
 
@@ -263,7 +262,10 @@ def unpack_header(payload: bytes) -> StreamHeader:
         header = _header(description, _fields(description, values, coded))
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
-    if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
+    names = header.dynamic | header.static.keys()
+    begun = {row.optional for row in STATE_TABLE if row.name in names}
+    complete = {row.name for row in STATE_TABLE if row.optional is None or row.optional in begun}
+    if names != complete or (header.reference and header.codec == "raw"):
         check_codec(header.codec)
         raise StreamError("The init record must hold exactly the fields that packets do not carry.")
     check_shapes(
@@ -282,11 +284,6 @@ def check_codec(codec: str) -> None:
             f"The stream is coded with {codec!r}; this version knows 'raw' and 'compact'. "
             "Install a newer structgstream."
         )
-
-
-def _complete(names: Set[FieldName]) -> bool:
-    begun = {row.optional for row in STATE_TABLE if row.name in names}
-    return names == {row.name for row in STATE_TABLE if row.optional is None or row.optional in begun}
 
 
 def _fields(

@@ -118,10 +118,6 @@ _LATENCY_FRAMES = 3.0
 _ENTRY_BYTES = 1024
 
 
-def _unknown(frame: int) -> float | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Clocks:
     """Where times come from."""
@@ -129,7 +125,7 @@ class Clocks:
     wall: Callable[[], float] = time.time  # seconds since 1970
     elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
     # when a frame was filmed, by its number, in seconds since 1970; None where that is not known
-    captured: Callable[[int], float | None] = _unknown
+    captured: Callable[[int], float | None] = lambda frame: None
 
 
 class SegmentsSink:
