@@ -127,7 +127,6 @@ def test_a_damaged_sound_costs_no_frame() -> None:
     first = next(record for record in scan_records(data) if record.type == RecordType.SOUND)
     reader = StreamReader(flipped(data, 8 * (first.offset + 10)))
     assert len(reader) == FRAMES
-    assert reader.cut_reason is not None
     assert reader.cut_reason.endswith("no frame is lost")
     assert [reader.sound(i) for i in range(FRAMES)] == [None, *sounds()[1:]]
     assert reader.scene(FRAMES - 1) is not None
@@ -175,7 +174,6 @@ def test_segments_are_the_bytes_of_the_file_also_continued(tmp_path: Path, end: 
     sink, _ = resume_segments(store)
     write(sink, end=end)  # and is killed
     sink, found = resume_segments(store)
-    assert found is not None
     assert [info.bytes for info in found.packets] == [info.bytes for info in StreamReader(whole_stream()).packets][:end]
     write(sink, start=end)
     sink.close()

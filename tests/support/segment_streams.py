@@ -113,7 +113,6 @@ class KilledStore:
         store: what is really written.
         at: number of the operation, or how it begins.
         done: whether that operation is still done.
-        left: name of the file of which a killed writer leaves a torn temporary one.
     """
 
     store: FolderStore

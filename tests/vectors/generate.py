@@ -331,13 +331,8 @@ def sound_stream() -> bytes:
         static={name: value for name, value in state.items() if name not in dynamic},
         sound=SoundFormat(1),
     )
-    return streamed(
-        header,
-        [clapping_scene(index) for index in range(SOUND_FRAMES)],
-        SOUND_KINDS,
-        fps=SOUND_FPS,
-        sounds=clapping_sounds(),
-    )
+    scenes = [clapping_scene(index) for index in range(SOUND_FRAMES)]
+    return streamed(header, scenes, SOUND_KINDS, fps=SOUND_FPS, sounds=clapping_sounds())
 
 
 def sound_report(data: bytes) -> dict[str, Any]:

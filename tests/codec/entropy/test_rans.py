@@ -34,17 +34,9 @@ def drawn(seed: int, *, count: int, contexts: int = 5, alphabet: int = 16, even:
     context = g.integers(0, contexts, count).astype(np.uint16)
     spread = np.linspace(0.3, 3.0, contexts)[context]
     symbol = g.integers(0, alphabet, count) if even else np.minimum(g.geometric(1 / (1 + spread)) - 1, alphabet - 1)
-    return (
-        symbol.astype(np.uint8),
-        context,
-        normalize_counts(counted(symbol, context, contexts=contexts, alphabet=alphabet)),
-    )
-
-
-def counted(symbols: np.ndarray, context: np.ndarray, *, contexts: int, alphabet: int) -> np.ndarray:
     counts = np.zeros((contexts, alphabet), np.int64)
-    np.add.at(counts, (context, symbols), 1)
-    return counts
+    np.add.at(counts, (context, symbol), 1)
+    return symbol.astype(np.uint8), context, normalize_counts(counts)
 
 
 @both

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The manifest of a stream that runs for weeks stays small, and every segment is found again."""
 
+from pathlib import Path
+
 import pytest
 
 from structgstream.codec.packets import PacketKind
@@ -16,36 +18,13 @@ from structgstream.codec.segments.manifest import (
     manifest_from_json,
     manifest_to_json,
 )
+from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import paged, segments_from
 from structgstream.errors import StreamError
 from tests.support.segment_streams import SHA256, segment_entry
 
 
-class Memory:
-    """A store without a disk."""
-
-    name = "memory"
-
-    def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
-
-    def put(self, name: str, data: bytes) -> None:
-        self.files[name] = data
-
-    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        return self.files[name]
-
-    def delete(self, name: str) -> None:
-        del self.files[name]
-
-    def names(self) -> frozenset[str]:
-        return frozenset(self.files)
-
-    def free_bytes(self) -> int | None:
-        return None
-
-
-def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
+def grown(folder: Path, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
     """History and segments after as many groups, and the longest that both together were as JSON."""
     history: tuple[HistoryEntry, ...] = ()
     listed: tuple[SegmentEntry, ...] = ()
@@ -53,7 +32,7 @@ def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry
     for number in range(segments):
         found = paged(history, (*listed, segment_entry(number, frames=frames, sizes=(123_456, 45_678))))
         for name, data in found.pages:
-            store.put(name, data)
+            (folder / name).write_bytes(data)
         history, listed = found.history, found.segments
         if number % 61 == 60:
             longest = max(longest, len(manifest_to_json(manifest(history, listed, frames))))
@@ -72,10 +51,10 @@ def manifest(history: tuple[HistoryEntry, ...], listed: tuple[SegmentEntry, ...]
 
 
 @pytest.mark.parametrize(("segments", "frames"), [(33_000, 3), (2_000, 90)])
-def test_a_manifest_stays_below_50_kb_and_everything_is_found(segments: int, frames: int) -> None:
+def test_a_manifest_stays_below_50_kb_and_everything_is_found(tmp_path: Path, segments: int, frames: int) -> None:
     """After 33000 groups the third level is reached; long groups have long entries."""
-    store = Memory()
-    history, listed, longest = grown(store, segments, frames)
+    store = FolderStore(tmp_path)
+    history, listed, longest = grown(tmp_path, segments, frames)
     assert longest < 50_000
     whole = manifest(history, listed, frames)
     assert manifest_from_json(manifest_to_json(whole), name="x") == whole
@@ -83,16 +62,17 @@ def test_a_manifest_stays_below_50_kb_and_everything_is_found(segments: int, fra
     late = segments - 1_500
     assert [entry.segment for entry in segments_from(store, history, listed, first=late)] == [*range(late, segments)]
     assert next(segments_from(store, history, listed)).segment == 0
-    assert all(len(data) < 50_000 for data in store.files.values())
+    assert all(path.stat().st_size < 50_000 for path in tmp_path.iterdir())
 
 
-def test_a_page_that_was_changed_is_refused() -> None:
-    store = Memory()
-    history, listed, _ = grown(store, 100, 3)
-    name = history[0].file
-    store.files[name] = store.files[name].replace(b"45678", b"45679")
-    with pytest.raises(StreamError, match=f"{name} in memory is damaged"):
-        list(segments_from(store, history, listed))
-    store.files[name] += b" "
-    with pytest.raises(StreamError, match="the manifest states"):
-        list(segments_from(store, history, listed))
+def test_a_page_that_was_changed_is_refused(tmp_path: Path) -> None:
+    history, listed, _ = grown(tmp_path, 100, 3)
+    page = tmp_path / history[0].file
+    data = page.read_bytes()
+    for changed, message in (
+        (data.replace(b"45678", b"45679"), f"{page.name} in {tmp_path} is damaged"),
+        (data + b" ", "the manifest states"),
+    ):
+        page.write_bytes(changed)
+        with pytest.raises(StreamError, match=message):
+            list(segments_from(FolderStore(tmp_path), history, listed))
