@@ -119,6 +119,7 @@ class PacketSink(Protocol):
 
     def begin(self, header: StreamHeader) -> int:
         """Begin another period with the next packet, a key packet; returns the bytes of its init record."""
+        ...
 
     def write(self, packet: Packet) -> int: ...
 

@@ -110,11 +110,9 @@ def check_prefix(data: ByteSource, name: str) -> None:
         raise StreamError(f"{name} is cut at byte {len(data)}, before its first frame.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
-        newer, older = (
-            "Install a newer structgstream.",
-            "Reconstruct it again, or install the structgstream that wrote it.",
-        )
-        advice = newer if major > MAJOR else older
+        advice = "Reconstruct it again, or install the structgstream that wrote it."
+        if major > MAJOR:
+            advice = "Install a newer structgstream."
         raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
@@ -152,9 +150,8 @@ def footer_offset(data: ByteSource) -> int | None:
     if magic != FOOTER_MAGIC or not PREFIX.size <= offset < at:
         return None
     head = read_head(data, offset)
-    if head is None or head.type != RecordType.INDEX or offset + head.bytes != at:
-        return None
-    return offset
+    is_index = head is not None and head.type == RecordType.INDEX and offset + head.bytes == at
+    return offset if is_index else None
 
 
 def incomplete_reason(data: ByteSource, offset: int) -> str:

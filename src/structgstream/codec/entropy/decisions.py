@@ -70,16 +70,11 @@ class Model:
         """An independent copy."""
         return Model(self.chances.copy(), self.seen.copy(), self.weights.copy(), self.starts)
 
-    @property
-    def nodes(self) -> int:
-        """Number of binary decisions (nodes) of a value."""
-        return self.chances.shape[1]
-
     @cached_property
     def native(self) -> NativeModel:
         """The same memory as a C structure."""
         arrays = (self.chances, self.seen, self.weights, self.starts)
-        return NativeModel(*(array.ctypes.data for array in arrays), len(self.starts), self.nodes)
+        return NativeModel(*(array.ctypes.data for array in arrays), len(self.starts), self.chances.shape[1])
 
 
 class Models:
@@ -202,7 +197,7 @@ class _Coder:
         self._chances, self._seen = model.chances.ravel().tolist(), model.seen.ravel().tolist()
         self._weights: list[list[int]] = model.weights.tolist()
         self._starts = model.starts.tolist()
-        self._nodes = model.nodes
+        self._nodes = model.chances.shape[1]
         self._data = arithmetic.buffer[: arithmetic.place if self._encodes else None].tobytes()
         self._out = bytearray(self._data)
         self._place, self._low, self._range = arithmetic.place, arithmetic.low, arithmetic.range

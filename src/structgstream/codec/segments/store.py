@@ -51,23 +51,29 @@ class Store(Protocol):
     @property
     def name(self) -> str:
         """For messages."""
+        ...
 
     def put(self, name: str, data: bytes) -> None:
         """Write a file, or replace it in one step: readers see the old bytes or the new ones. Raises StorageError if it
         cannot be written; what was there before stays."""
+        ...
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """The bytes of a file. Raises StreamError if there is none, or it cannot be read, or has more bytes than
         ``max_bytes``."""
+        ...
 
     def delete(self, name: str) -> None:
         """Remove a file if it is there. Raises StorageError if it cannot be removed."""
+        ...
 
     def names(self) -> frozenset[str]:
         """The names of all files that a sink has made. Raises StreamError if they cannot be listed."""
+        ...
 
     def free_bytes(self) -> int | None:
         """Room that is left; None if that is not known or not bounded."""
+        ...
 
 
 @contextmanager
