@@ -42,18 +42,14 @@ from tests.support.period_streams import (
 )
 from tests.support.properties import thinned
 from tests.support.rigs import arc_rig
-from tests.support.streams import same, small_stream
+from tests.support.streams import flipped, same, small_stream
 
 CODECS = ("raw", "compact")
 
 
-def whole(codec: str = "compact") -> tuple[bytes, list[Scene]]:
-    return period_stream(codec=codec)
-
-
 def offsets(kind: RecordType) -> list[tuple[int, int]]:
     """Where the records of a type begin and end."""
-    return [(record.offset, record.end) for record in scan_records(whole()[0]) if record.type == kind]
+    return [(record.offset, record.end) for record in scan_records(period_stream()[0]) if record.type == kind]
 
 
 def group(frame: int) -> range:
@@ -65,7 +61,7 @@ def group(frame: int) -> range:
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("by_index", [False, True])
 def test_every_frame_is_decoded_with_the_header_of_its_period(codec: str, by_index: bool) -> None:
-    data, seen = whole(codec)
+    data, seen = period_stream(codec=codec)
     reader = StreamReader(data, by_index=by_index)
     assert (len(reader), reader.complete, reader.runs) == (FRAMES, True, [range(FRAMES)])
     assert [(one.number, one.first_frame) for one in reader.periods] == [*enumerate(FIRSTS)]
@@ -75,7 +71,7 @@ def test_every_frame_is_decoded_with_the_header_of_its_period(codec: str, by_ind
 
 
 def test_the_bytes_are_a_prefix_init_records_packets_and_an_index_of_all() -> None:
-    data, _ = whole()
+    data, _ = period_stream()
     assert PREFIX.unpack(data[: PREFIX.size])[1:] == (2, MINOR_WITH_PERIODS)
     *records, index = scan_records(data)
     frames = [record for record in records if record.type != RecordType.INIT]
@@ -99,7 +95,7 @@ def test_a_stream_of_one_period_is_what_it_was() -> None:
 
 
 def test_any_bit_of_a_packet_costs_its_group_and_never_shows_another_periods_scene() -> None:
-    data, seen = whole()
+    data, seen = period_stream()
     packets = [record for record in scan_records(data) if record.type in (RecordType.KEY, RecordType.DELTA)]
     for frame, record in enumerate(packets):
         for bit in (
@@ -110,7 +106,7 @@ def test_any_bit_of_a_packet_costs_its_group_and_never_shows_another_periods_sce
 
 
 def test_any_bit_of_an_init_record_costs_its_period() -> None:
-    data, seen = whole()
+    data, seen = period_stream()
     for period, (start, end) in enumerate(offsets(RecordType.INIT)):
         if not period:
             continue
@@ -121,9 +117,7 @@ def test_any_bit_of_an_init_record_costs_its_period() -> None:
 
 def check(data: bytes, seen: list[Scene], bit: int, *, lost: set[int]) -> None:
     """With one bit flipped exactly ``lost`` cannot be shown, and every other frame is what it was."""
-    mangled = bytearray(data)
-    mangled[bit // 8] ^= 1 << bit % 8
-    reader = StreamReader(bytes(mangled))
+    reader = StreamReader(flipped(data, bit))
     shown = {index for run in reader.runs for index in run}
     assert shown == {*range(FRAMES)} - lost, bit
     assert len(reader.damage) == 1
@@ -134,24 +128,18 @@ def check(data: bytes, seen: list[Scene], bit: int, *, lost: set[int]) -> None:
 
 def test_an_init_record_and_its_key_packet_may_both_be_damaged() -> None:
     """What is before a whole init record then is unknown, until a packet says which frame it is."""
-    data, seen = whole()
-    mangled = bytearray(data)
-    first = [record for record in scan_records(data) if record.type != RecordType.INIT]
-    for record in (first[3], first[4]):  # the packet before period 1's init record, and the one after it
-        mangled[record.offset + 30] ^= 4
-    reader = StreamReader(bytes(mangled))
+    data, seen = period_stream()
+    frames = [record for record in scan_records(data) if record.type != RecordType.INIT]
+    # The packet before period 1's init record, and the one after it.
+    reader = StreamReader(flipped(data, *(8 * (record.offset + 30) + 2 for record in frames[3:5])))
     assert reader.runs == [range(3), range(6, FRAMES)]
     assert [one.number for one in reader.periods] == [0, 1, 2]
     assert all(same(reader.scene(index), seen[index]) for index in (2, 6, 7, 9))
 
 
 def test_two_periods_whose_init_records_are_damaged_are_lost_and_no_more() -> None:
-    data, seen = whole()
-    mangled = bytearray(data)
-    for start, end in offsets(RecordType.INIT)[1:]:
-        mangled[end - 3] ^= 1
-        assert start < end
-    reader = StreamReader(bytes(mangled))
+    data, seen = period_stream()
+    reader = StreamReader(flipped(data, *(8 * (end - 3) for _, end in offsets(RecordType.INIT)[1:])))
     assert reader.runs == [range(4)]
     assert len(reader.packets) == 4
     assert same(reader.scene(3), seen[3])
@@ -160,7 +148,7 @@ def test_two_periods_whose_init_records_are_damaged_are_lost_and_no_more() -> No
 
 
 def test_a_file_cut_anywhere_shows_what_is_whole_and_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    data, seen = whole()
+    data, seen = period_stream()
     headers, packets, _ = period_packets()
     ends = [record.end for record in scan_records(data) if record.type in (RecordType.KEY, RecordType.DELTA)]
     path = tmp_path / "cut.sgs"
@@ -191,7 +179,7 @@ def test_an_orderly_stop_where_a_period_would_begin_leaves_nothing_of_it() -> No
 
 
 def test_periods_that_contradict_each_other_are_refused() -> None:
-    data, _ = whole()
+    data, _ = period_stream()
     (_, _), (start, end), _ = offsets(RecordType.INIT)
     init, key = data[start:end], next(one for one in scan_records(data, end))
     packet = key.payload
@@ -214,7 +202,7 @@ def test_periods_that_contradict_each_other_are_refused() -> None:
 
 def test_an_index_that_leaves_out_a_period_is_not_believed() -> None:
     """Otherwise the frames of a period would be decoded with another one's header."""
-    data, seen = whole()
+    data, seen = period_stream()
     *_, index = scan_records(data)
     entries = [*INDEX_ENTRY.iter_unpack(index.payload)]
     for left_out in ([RecordType.INIT], []):
@@ -227,11 +215,9 @@ def test_an_index_that_leaves_out_a_period_is_not_believed() -> None:
 
 
 def test_an_init_record_damaged_after_opening_costs_its_period(tmp_path: Path) -> None:
-    data, seen = whole()
+    data, seen = period_stream()
     path = tmp_path / "late.sgs"
-    mangled = bytearray(data)
-    mangled[offsets(RecordType.INIT)[1][0] + 40] ^= 1
-    path.write_bytes(bytes(mangled))
+    path.write_bytes(flipped(data, 8 * (offsets(RecordType.INIT)[1][0] + 40)))
     with open_stream(path, by_index=True) as reader:
         assert same(reader.scene(3), seen[3])
         with pytest.raises(StreamError, match="The init record of period 1 of .*late.sgs, at byte .*, is damaged"):
@@ -249,12 +235,9 @@ def inits() -> list[Record]:
     return [record for record in scan_records(data) if record.type == RecordType.INIT]
 
 
-def table(data: bytes | bytearray | None = None) -> PeriodTable:
-    """The table of the stream, or of damaged bytes of it, as it is after opening."""
-    found = PeriodTable(memoryview(period_stream(codec=CODEC)[0] if data is None else data), "a.sgs", inits()[0])
-    for first, record in zip(FIRSTS[1:], inits()[1:], strict=True):
-        found.periods.append(Period(record.period, first, record.offset, record.end - record.offset))
-    return found
+def table() -> PeriodTable:
+    """The table of the stream before a second period is found."""
+    return PeriodTable(period_stream(codec=CODEC)[0], "a.sgs", inits()[0])
 
 
 @pytest.mark.parametrize("kind", [RecordType.INIT, RecordType.KEY])
@@ -268,13 +251,8 @@ def test_a_whole_record_of_another_number_or_type_is_refused(kind: RecordType) -
 
 def other_near(header: StreamHeader) -> StreamHeader:
     rig = header.rig
-    cameras = {name: rig[name] for name in rig}
-    name = next(iter(cameras))
-    return replace(header, rig=replace(rig, cameras=cameras | {name: replace(cameras[name], near=0.5)}))
-
-
-def other_held_out(header: StreamHeader) -> StreamHeader:
-    return replace(header, rig=replace(header.rig, held_out=frozenset([list(header.rig)[-1]])))
+    name = next(iter(rig))
+    return replace(header, rig=replace(rig, cameras={**rig.cameras, name: replace(rig[name], near=0.5)}))
 
 
 @pytest.mark.parametrize(
@@ -282,7 +260,7 @@ def other_held_out(header: StreamHeader) -> StreamHeader:
     [
         (lambda header: replace(header, rig=arc_rig(len(list(header.rig)), radius=3.1)), "cameras"),
         (other_near, "cameras"),
-        (other_held_out, "cameras"),
+        (lambda header: replace(header, rig=header.rig.with_held_out(frozenset([[*header.rig][-1]]))), "cameras"),
         (lambda header: replace(header, similarity=Similarity((0.1, -0.25, 3.5), 0.7)), "similarity"),
         (lambda header: replace(header, similarity=Similarity((0.1, -0.25, 3.0), 0.8)), "similarity"),
         (lambda header: replace(header, fps=25.0), "frames a second"),

@@ -19,7 +19,7 @@ from structgstream.codec.sinks import FileSink, MemorySink, readable_part
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from tests.support.properties import examples
-from tests.support.streams import compact_header, moved, same, small_scene, small_stream, write_stream
+from tests.support.streams import compact_header, flipped, moved, same, small_scene, small_stream, write_stream
 
 WHOLE = small_stream()
 with StreamReader(WHOLE) as _reader:
@@ -30,26 +30,20 @@ with StreamReader(WHOLE) as _reader:
 @examples(400)
 def test_a_bit_that_flipped_never_costs_whole_frames(byte: int, bit: int) -> None:
     """Whatever it is in, the init record, a length, or a packet before the last: nothing after it is given up."""
-    data = bytearray(WHOLE)
-    data[byte] ^= 1 << bit
     with pytest.raises(StreamError, match="^Cannot continue it: .* Keep a copy"):
-        readable_part(bytes(data), name="it")
+        readable_part(flipped(WHOLE, 8 * byte + bit), name="it")
 
 
 @pytest.mark.parametrize("power", range(32))
 def test_a_flipped_bit_in_the_length_of_the_init_record_is_no_cut(power: int) -> None:
     """The record then seems to be longer than the file, as that of a writer that was killed at its start."""
-    data = bytearray(WHOLE)
-    length = struct.unpack_from("<I", data, PREFIX.size + RECORD.size - 4)[0]
-    struct.pack_into("<I", data, PREFIX.size + RECORD.size - 4, length ^ 1 << power)
+    length = 8 * (PREFIX.size + RECORD.size - 4)
     with pytest.raises(StreamError, match="Cannot continue it"):
-        readable_part(bytes(data), name="it")
+        readable_part(flipped(WHOLE, length + power), name="it")
 
 
 def test_damage_at_the_end_is_a_write_that_was_interrupted() -> None:
-    data = bytearray(WHOLE[: ENDS[-1]])
-    data[-1] ^= 1
-    assert readable_part(bytes(data), name="it") == ENDS[-2]
+    assert readable_part(flipped(WHOLE[: ENDS[-1]], 8 * ENDS[-1] - 8), name="it") == ENDS[-2]
 
 
 @pytest.mark.parametrize("data", [b"", prefix()[:3], prefix()])
@@ -72,13 +66,6 @@ def whole() -> tuple[bytes, list[Scene], list[int]]:
 
 def group(frame: int) -> range:
     return range(frame, min(frame // 3 * 3 + 3, FRAMES))
-
-
-def flipped(data: bytes, *bits: int) -> bytes:
-    mangled = bytearray(data)
-    for bit in bits:
-        mangled[bit // 8] ^= 1 << bit % 8
-    return bytes(mangled)
 
 
 def check(reader: StreamReader, lost: set[int]) -> None:
@@ -151,7 +138,6 @@ def test_damage_of_what_is_no_packet_costs_no_frame() -> None:
     foreign += struct.pack("<I", zlib.crc32(foreign) ^ 1)
     reader = StreamReader(data[: offsets[3]] + foreign + data[offsets[3] :])
     assert (len(reader), reader.damage) == (FRAMES, [Damage(offsets[3], range(2, 2))])
-    assert reader.cut_reason is not None
     assert reader.cut_reason.endswith("; no frame is lost")
     check(reader, set())
 
@@ -205,7 +191,6 @@ def test_heads_across_pieces_of_a_search(monkeypatch: pytest.MonkeyPatch) -> Non
     for size in (8, 9, 64, 1000):
         monkeypatch.setattr(contents, "_CHUNK_BYTES", size)
         found = PacketSearch(data).next(offsets[1], Standing(offsets[1], 0, 0.0))
-        assert found is not None
         assert found.offset == offsets[2]
 
 

@@ -20,7 +20,7 @@ from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.codec.sound import FrameSound, SoundFormat, frame_sound, sound_format, unpack_sound
 from structgstream.errors import StreamError
 from structgstream.opus import PACKET_SECONDS, OpusPacket, is_packet
-from tests.support.streams import small_stream
+from tests.support.streams import flipped, small_stream
 
 SILENCE = bytes([0xF8, 0xFF, 0xFE])  # 20 ms
 FRAMES = 4
@@ -123,12 +123,10 @@ def test_packets_after_a_gap_begin_again() -> None:
 
 
 def test_a_damaged_sound_costs_no_frame() -> None:
-    data = bytearray(whole_stream())
-    first = next(record for record in scan_records(bytes(data)) if record.type == RecordType.SOUND)
-    data[first.offset + 10] ^= 1
-    reader = StreamReader(bytes(data))
+    data = whole_stream()
+    first = next(record for record in scan_records(data) if record.type == RecordType.SOUND)
+    reader = StreamReader(flipped(data, 8 * (first.offset + 10)))
     assert len(reader) == FRAMES
-    assert reader.cut_reason is not None
     assert reader.cut_reason.endswith("no frame is lost")
     assert [reader.sound(i) for i in range(FRAMES)] == [None, *sounds()[1:]]
     assert reader.scene(FRAMES - 1) is not None
@@ -176,7 +174,6 @@ def test_segments_are_the_bytes_of_the_file_also_continued(tmp_path: Path, end: 
     sink, _ = resume_segments(store)
     write(sink, end=end)  # and is killed
     sink, found = resume_segments(store)
-    assert found is not None
     assert [info.bytes for info in found.packets] == [info.bytes for info in StreamReader(whole_stream()).packets][:end]
     write(sink, start=end)
     sink.close()

@@ -100,7 +100,7 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         lambda: rans._native_encode(np.zeros(2, np.uint8), np.zeros(2, np.uint16), tables(), lanes=1),
     ),
     "decisions": (
-        decisions,
+        rans,
         "sgs_code_numbers",
         1,
         lambda: decisions._code_native("sgs_code_numbers", ArithmeticState(None), [], 0),

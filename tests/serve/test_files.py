@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
+from structgstream.codec.segments.manifest import file_name
 from structgstream.serve.streams import hash_in_name, is_plain_path, is_stream_name, open_below
 from tests.support.properties import examples
 
@@ -122,7 +122,7 @@ def test_a_name_of_a_stream_is_one_part_of_an_address_as_it_stands(name: str) ->
 @examples(200)
 def test_the_hash_is_found_in_every_name_that_a_writer_gives(number: int, data: bytes) -> None:
     digest = data.hex().ljust(64, "0")
-    for name in (init_name, part_name, segment_name, history_name):
-        file = name(number, digest)
+    for kind in ("init", "part", "segment", "history"):
+        file = file_name(kind, number, digest)
         assert hash_in_name(file) == digest[:16]
         assert is_plain_path(f"/{file}".encode())

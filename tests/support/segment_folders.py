@@ -11,14 +11,11 @@ from structgstream.codec.segments.manifest import (
     Edge,
     Manifest,
     PartEntry,
-    PeriodEntry,
     SegmentEntry,
     Window,
-    init_name,
     manifest_to_json,
-    sha256_of,
 )
-from structgstream.codec.segments.recovery import part_of, segment_of
+from structgstream.codec.segments.recovery import part_of, period_entry, segment_of
 from structgstream.codec.segments.store import FolderStore
 
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
@@ -44,8 +41,7 @@ class GrowingFolder:
         self._stream, self._name = stream, name
         self.frames = len(records)
         data = stream[: init.end]
-        digest = sha256_of(data)
-        self._period = PeriodEntry(0, init_name(0, digest), len(data), digest, 0, 0)
+        self._period = period_entry(data, 0, first_frame=0, first_segment=0)
         self._store.put(self._period.file, data)
 
     def write(self) -> Manifest:

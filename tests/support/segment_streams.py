@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of segments that several tests write, and stores that fail."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder
-from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.manifest import SegmentEntry, file_name, sha256_of
+from structgstream.codec.segments.sink import Clocks, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
-from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
+from structgstream.codec.sinks import MemorySink, resume_segments
 from tests.support.streams import header_for, moved, small_scene
+
+SHA256 = sha256_of(b"")
+"""What entries of files state whose content does not matter."""
 
 
 class Killed(BaseException):
@@ -30,6 +34,15 @@ def packets(frames: int, *, group: int = 3) -> list[Packet]:
     return [
         encoder.encode(scene, index=i, pts_seconds=i / 30.0, kind=kinds[i]).packet for i, scene in enumerate(scenes)
     ]
+
+
+def segment_entry(
+    number: int, *, frames: int = 3, sizes: tuple[int, int] = (100, 10), fps: float = 30.0
+) -> SegmentEntry:
+    """A segment of as many frames as each before it, of these sizes of key and delta packets."""
+    first, all_sizes = number * frames, (sizes[0], *[sizes[1]] * (frames - 1))
+    name, seconds = file_name("segment", number, SHA256), (first / fps, (first + frames - 1) / fps)
+    return SegmentEntry(number, name, 0, first, frames, seconds, sum(all_sizes), sizes[0], all_sizes, SHA256)
 
 
 def as_file(sent: Sequence[Packet]) -> bytes:
@@ -65,28 +78,21 @@ def written(
     *,
     options: SegmentsOptions | None = None,
     hands: Hands | None = None,
-    seconds: float = 1.0,
     after: Callable[[int], object] = lambda frame: None,
+    periods: Mapping[int, StreamHeader] | None = None,
 ) -> None:
-    """Write a stream, or what is missing of one, as a session does; ``seconds`` pass with every frame."""
-    hands = hands or Hands()
+    """Write a stream, or what is missing of one, as a session does; a second passes with every frame. ``periods`` are
+    headers by first frame, if there are several."""
+    hands, periods = hands or Hands(), periods or {0: header()}
     sink, resumed = resume_segments(store, options=options, clocks=hands.clocks())
-    _write(sink, sent[0 if resumed is None else len(resumed) :], resumed, hands, seconds, after)
-
-
-def _write(
-    sink: SegmentsSink,
-    sent: Sequence[Packet],
-    resumed: StoredSegments | None,
-    hands: Hands,
-    seconds: float,
-    after: Callable[[int], object],
-) -> None:
-    if resumed is not None and resumed.complete and not sent:
+    start = 0 if resumed is None else len(resumed)
+    if resumed is not None and resumed.complete and start == len(sent):
         return
-    sink.open(header() if resumed is None else resumed.header)
-    for packet in sent:
-        hands.wait(seconds)
+    sink.open(periods[0] if resumed is None else resumed.header_of(start - 1))
+    for packet in sent[start:]:
+        hands.wait(1.0)
+        if packet.index and packet.index in periods:
+            sink.begin(periods[packet.index])
         sink.write(packet)
         after(packet.index)
     sink.close()
@@ -107,7 +113,6 @@ class KilledStore:
         store: what is really written.
         at: number of the operation, or how it begins.
         done: whether that operation is still done.
-        left: name of the file of which a killed writer leaves a torn temporary one.
     """
 
     store: FolderStore

@@ -106,6 +106,14 @@ def small_stream(frames: int = 4) -> bytes:
     return sink.data
 
 
+def flipped(data: bytes, *bits: int) -> bytes:
+    """``data`` with these bits changed, by number from the lowest of the first byte."""
+    mangled = bytearray(data)
+    for bit in bits:
+        mangled[bit // 8] ^= 1 << bit % 8
+    return bytes(mangled)
+
+
 def same(a: Scene, b: Scene) -> bool:
     """Whether two scenes are equal bit for bit, NaN included."""
     one, other = state_of(a), state_of(b)

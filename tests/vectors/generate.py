@@ -9,7 +9,7 @@ version or codec gets vectors of its own; files that are there stay: ``python te
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,8 +63,8 @@ COMPACT_STEPS = {
     "free_colors": float(np.float32(0.007)),
 }
 COMPACT_INIT_STEPS: dict[FieldName, float] = {
-    "anchor_positions": 1 / 256,
-    "offset_scales": float(np.float32(0.02)),
+    "anchor_positions": COMPACT_STEPS["anchor_positions"],
+    "offset_scales": COMPACT_STEPS["offset_scales"],
     "base_scales": float(np.float32(0.01)),
     "anchor_offsets": 1 / 16,
     "anchor_features": float(np.float32(0.03)),
@@ -228,24 +228,28 @@ def periods_scenes() -> list[Scene]:
 
 def periods_stream() -> bytes:
     """That of two periods."""
-    headers, sink = (replace(compact_header(), periods=True), later_header()), MemorySink()
-    sink.open(headers[0])
-    encoder = SceneEncoder(headers[0])
-    for index, (scene, kind) in enumerate(zip(periods_scenes(), PERIODS_KINDS, strict=True)):
-        if index == LATER:
-            sink.begin(headers[1])
-            encoder = SceneEncoder(headers[1])
-        sink.write(encoder.encode(scene, index=index, pts_seconds=index / 4, kind=kind).packet)
-    sink.close()
-    return sink.data
+    header = replace(compact_header(), periods=True)
+    return streamed(header, periods_scenes(), PERIODS_KINDS, later={LATER: later_header()})
 
 
-def streamed(header: StreamHeader, scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> bytes:
-    """The whole stream as today's encoder writes it."""
+def streamed(
+    header: StreamHeader,
+    scenes: Sequence[Scene],
+    kinds: Sequence[PacketKind],
+    *,
+    fps: int = 4,
+    later: Mapping[int, StreamHeader] | None = None,
+    sounds: Sequence[FrameSound] = (),
+) -> bytes:
+    """The whole stream as today's encoder writes it, with headers of ``later`` periods by their first frame."""
     encoder, sink = SceneEncoder(header), MemorySink()
     sink.open(header)
     for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True)):
-        sink.write(encoder.encode(scene, index=index, pts_seconds=index / 4, kind=kind).packet)
+        if later and index in later:
+            sink.begin(later[index])
+            encoder = SceneEncoder(later[index])
+        packet = encoder.encode(scene, index=index, pts_seconds=index / fps, kind=kind).packet
+        sink.write(replace(packet, sound=sounds[index].pack()) if sounds else packet)
     sink.close()
     return sink.data
 
@@ -274,6 +278,7 @@ def compact_stream() -> bytes:
 
 CLAP_SECONDS, SOUND_FRAMES, SOUND_FPS = 0.5, 12, 12
 """A second with a clap in its middle: the frame of that time is white, the others are black."""
+SOUND_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.DELTA) * 3
 
 
 def clapping_scene(frame: int) -> Scene:
@@ -326,21 +331,13 @@ def sound_stream() -> bytes:
         static={name: value for name, value in state.items() if name not in dynamic},
         sound=SoundFormat(1),
     )
-    encoder, sink = SceneEncoder(header), MemorySink()
-    sink.open(header)
-    for sound in clapping_sounds():
-        kind = PacketKind.DELTA if sound.index % 4 else PacketKind.KEY
-        seconds = sound.index / SOUND_FPS
-        packet = encoder.encode(clapping_scene(sound.index), index=sound.index, pts_seconds=seconds, kind=kind).packet
-        sink.write(replace(packet, sound=sound.pack()))
-    sink.close()
-    return sink.data
+    scenes = [clapping_scene(index) for index in range(SOUND_FRAMES)]
+    return streamed(header, scenes, SOUND_KINDS, fps=SOUND_FPS, sounds=clapping_sounds())
 
 
 def sound_report(data: bytes) -> dict[str, Any]:
     """What is in the stream with sound; the packets of Opus are those that it was written with."""
-    kinds = [PacketKind.DELTA if index % 4 else PacketKind.KEY for index in range(SOUND_FRAMES)]
-    report = reported([clapping_scene(index) for index in range(SOUND_FRAMES)], kinds)
+    report = reported([clapping_scene(index) for index in range(SOUND_FRAMES)], SOUND_KINDS)
     with StreamReader(data) as reader:
         for frame in report["frames"]:
             sound = reader.sound(frame["index"])

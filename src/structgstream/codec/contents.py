@@ -25,6 +25,7 @@ from structgstream.codec.container.records import (
     RecordType,
     indexed_frames,
     period_at,
+    read_frame,
     read_head,
     read_record,
     scan_records,
@@ -64,6 +65,10 @@ class Standing:
         """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""
         return self.frames + (offset - self.offset) // MIN_PACKET_BYTES
 
+    def allows(self, index: Record) -> bool:
+        """Whether an index record lists as many frames as there may be."""
+        return self.frames <= indexed_frames(index.payload) <= self.last_frame_at(index.offset)
+
 
 class PacketSearch:
     """Finds whole records after damage in ``data``.
@@ -85,7 +90,7 @@ class PacketSearch:
             if self._left < 0:
                 return None
             record = read_record(self._data, offset)
-            if record is not None and _fits(record, standing):
+            if record is not None and (record.type != RecordType.INDEX or standing.allows(record)):
                 return record
         return None
 
@@ -115,16 +120,8 @@ class PacketSearch:
             return head.length % INDEX_ENTRY.size == 0 and standing.frames <= entries <= 2 * last
         if head.length < FRAME.size:
             return False
-        start = offset + RECORD.size
-        index, pts_seconds = FRAME.unpack(self._data[start : start + FRAME.size])
+        index, pts_seconds = read_frame(self._data, offset)
         return standing.frames <= index <= last and standing.seconds < pts_seconds < math.inf
-
-
-def _fits(record: Record, standing: Standing) -> bool:
-    """Whether an index lists as many frames as there may be; True for other records."""
-    if record.type != RecordType.INDEX:
-        return True
-    return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)
 
 
 LOST = 2**64 - 1
@@ -182,11 +179,10 @@ class Packets(Sequence[PacketInfo]):
         head = read_head(self._data, offset)
         if head is None or head.type not in PACKET_KINDS or head.length < FRAME.size:
             raise self.damaged(index)
-        start = offset + RECORD.size
-        payload = ByteSlice(self._data, start, start + head.length)
-        number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
+        number, pts_seconds = read_frame(self._data, offset)
         if number != index:
             raise self.damaged(index)
+        payload = ByteSlice(self._data, start := offset + RECORD.size, start + head.length)
         try:
             blocks = [*iterate_blocks(payload, FRAME.size, where=f"Packet {index}")]
         except StreamError as error:
@@ -241,14 +237,12 @@ class Packets(Sequence[PacketInfo]):
 
 
 class PeriodTable:
-    """The periods of one stream, the first of which is always there. One header besides the first is in memory.
+    """The periods of one stream, the first of which is always there. One header besides the first is in memory. Raises
+    StreamError if the first init record is not valid.
 
     Attributes:
         first: the header of the first period.
         periods: those of which a packet has been found, in order; always the first.
-
-    Raises:
-        StreamError: the init record is not valid.
     """
 
     def __init__(self, data: ByteSource, name: str, init: Record) -> None:
@@ -346,22 +340,21 @@ class Scan:
         found: list[tuple[int, int]] = []  # damaged records and the frames expected there
         ended = False
         while not ended:
-            for record in scan_records(self._data, end):
-                end = record.end
-                if ended := record.type == RecordType.INDEX:
-                    self._fill_up(indexed_frames(record.payload) if self._broken else len(offsets))
+            record = next(scan_records(self._data, end), None)
+            if record is None:
+                standing = replace(self._broken or Standing(end, len(offsets), self._seconds), period=self._period)
+                if (following := search.next(end, standing)) is None:
                     break
+                found.append((end, len(offsets)))
+                self._broken, end = standing, following.offset
+                continue
+            end = record.end
+            if record.type == RecordType.INDEX:
+                ended = True
+                if self._broken is not None:
+                    self._fill_up(indexed_frames(record.payload))
+            else:
                 self._add(record)
-            if ended:
-                break
-            here = self._broken or Standing(end, len(offsets), self._seconds)
-            standing = replace(here, period=self._period)
-            following = search.next(end, standing)
-            if following is None:
-                break
-            found.append((end, len(offsets)))
-            self._broken = standing
-            end = following.offset
         damage = tuple(Damage(offset, range(frame, self._shown_from(frame))) for offset, frame in found)
         lost = [*(one.frames for one in damage), *self._gone.values()]
         self._packets.whole = min([frames.start for frames in lost if frames], default=len(offsets))

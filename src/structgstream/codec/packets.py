@@ -3,8 +3,9 @@
 with the shapes that fit together (docs/bitstream.md, Init record, Fields)."""
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,9 +16,8 @@ from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.container.blocks import (
     first_block,
     iterate_blocks,
-    pack_coded_block,
+    pack_blocks,
     pack_init,
-    pack_raw_block,
     read_description,
     unpack_blocks,
 )
@@ -160,11 +160,8 @@ ENVIRONMENT_ROWS = (1, 4, 9)
 def check_shapes(
     fields: Mapping[FieldName, Tensor], *, distance_input: bool, training_cameras: int, where: str
 ) -> None:
-    """Check that the shapes of the fields present are consistent.
-
-    Raises:
-        StreamError: naming the first field of another shape, its shape and the expected one.
-    """
+    """Check that the shapes of the fields present are consistent. Raises StreamError that names the first field of
+    another shape, its shape and the expected one."""
     sizes: dict[str, int] = {"V": training_cameras}
     for name, value in fields.items():
         _match(name, value, sizes, where)
@@ -221,15 +218,12 @@ def pack_header(header: StreamHeader) -> bytes:
     description = {
         "cameras": [
             {
+                **values,
                 "name": name,
                 "viewmat": header.rig[name].viewmat.flatten().tolist(),
                 "K": header.rig[name].K.flatten().tolist(),
-                "width": header.rig[name].width,
-                "height": header.rig[name].height,
-                "near": header.rig[name].near,
-                "held_out": name in header.rig.held_out,
             }
-            for name in header.rig
+            for name, values in header.rig.plain().items()
         ],
         "similarity": {"center": list(header.similarity.center), "scale": header.similarity.scale},
         "fps": header.fps,
@@ -245,13 +239,8 @@ def pack_header(header: StreamHeader) -> bytes:
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
-    blocks = [
-        pack_coded_block(f.name, coded[f.name]) if f.name in coded else pack_raw_block(f.name, part[f.name])
-        for part in (header.static, header.reference)
-        for f in STATE_TABLE
-        if f.name in part
-    ]
-    return pack_init(description, blocks)
+    blocks = (pack_blocks(part, coded).values() for part in (header.static, header.reference))
+    return pack_init(description, chain(*blocks))
 
 
 def check_picture_sizes(rig: CameraRig) -> None:
@@ -274,7 +263,10 @@ def unpack_header(payload: bytes) -> StreamHeader:
         header = _header(description, _fields(description, values, coded))
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
-    if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
+    names = header.dynamic | header.static.keys()
+    begun = {row.optional for row in STATE_TABLE if row.name in names}
+    complete = {row.name for row in STATE_TABLE if row.optional is None or row.optional in begun}
+    if names != complete or (header.reference and header.codec == "raw"):
         check_codec(header.codec)
         raise StreamError("The init record must hold exactly the fields that packets do not carry.")
     check_shapes(
@@ -293,11 +285,6 @@ def check_codec(codec: str) -> None:
             f"The stream is coded with {codec!r}; this version knows 'raw' and 'compact'. "
             "Install a newer structgstream."
         )
-
-
-def _complete(names: Set[FieldName]) -> bool:
-    begun = {row.optional for row in STATE_TABLE if row.name in names}
-    return names == {row.name for row in STATE_TABLE if row.optional is None or row.optional in begun}
 
 
 def _fields(

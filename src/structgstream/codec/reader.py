@@ -183,15 +183,16 @@ class StreamReader:
         Raises:
             StreamError: there is no such frame, or it has been damaged.
         """
-        place = first_run(self.runs, index)
-        if place == len(self.runs) or index not in self.runs[place]:
+        if not self._is_whole(index):
             raise self._missing(index)
         follows = index == self._decoded + 1
         self._decoded = NOTHING  # Until a packet has been decoded.
+        period = self._table.place(index)
+        if self._decoder[0] != period:
+            self._decoder = period, SceneDecoder(self._table.header(period))
         scene: Scene | None = None
-        decoder = self._decoder_of(index)
         for packet in [self.packets.packet(index)] if follows else self.group(index):
-            scene = decoder.decode(packet)
+            scene = self._decoder[1].decode(packet)
         assert scene is not None, "a group ends with its frame"
         self._decoded = index
         return scene
@@ -218,12 +219,9 @@ class StreamReader:
             self._drawn = index, on_device(self.scene(index), chosen.device)
         return render_picture(self._drawn[1], view, chosen)
 
-    def _decoder_of(self, index: int) -> SceneDecoder:
-        """The decoder of the period of a frame; a new one unless that is the period of the last decoded frame."""
-        place = self._table.place(index)
-        if self._decoder[0] != place:
-            self._decoder = place, SceneDecoder(self._table.header(place))
-        return self._decoder[1]
+    def _is_whole(self, index: int) -> bool:
+        place = first_run(self.runs, index)
+        return place < len(self.runs) and index in self.runs[place]
 
     def _missing(self, index: int) -> StreamError:
         if any(index in frames for frames in self._gone):
@@ -256,8 +254,7 @@ class StreamReader:
         Raises:
             StreamError: its record is whole and violates the format.
         """
-        place = first_run(self.runs, index)
-        return self.packets.sound(index) if place < len(self.runs) and index in self.runs[place] else None
+        return self.packets.sound(index) if self._is_whole(index) else None
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
         """Every frame from ``start`` on, one at a time, up to the first lost one."""

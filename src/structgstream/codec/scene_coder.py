@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block, unpack_blocks
+from structgstream.codec.container.blocks import pack_blocks, unpack_blocks
 from structgstream.codec.container.records import FRAME
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.decisions import Models
@@ -35,7 +35,7 @@ from structgstream.codec.packets import Packet, PacketKind, StreamHeader, check_
 from structgstream.errors import StreamError
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import STATE_TABLE, FieldName, parameters_of, scene_of, state_of
+from structgstream.scene.state import FieldName, parameters_of, scene_of, state_of
 
 SceneT = TypeVar("SceneT", covariant=True)
 
@@ -50,12 +50,8 @@ class CompactState:
 
 
 class CompactCoder:
-    """Encodes or decodes the frames of one stream in order; decoding may start at any key packet.
-
-    Raises:
-        StreamError: the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or
-            reference for one.
-    """
+    """Encodes or decodes the frames of one stream in order; decoding may start at any key packet. Raises StreamError if
+    the codec is unknown, or the header has dynamic fields that cannot be coded, or no step or reference for one."""
 
     def __init__(self, header: StreamHeader) -> None:
         check_codec(header.codec)
@@ -121,10 +117,8 @@ class CompactCoder:
 class SceneDecoder:
     """Decodes the packets of one stream, in order: a delta packet follows the packet before it.
 
-    Key packets, and with the ``raw`` codec all packets, can be decoded without the one before.
-
-    Raises:
-        StreamError: the codec is unknown to this version, or the header is inconsistent with it.
+    Key packets, and with the ``raw`` codec all packets, can be decoded without the one before. Raises StreamError if
+    the codec is unknown to this version, or the header is inconsistent with it.
     """
 
     def __init__(self, header: StreamHeader) -> None:
@@ -195,14 +189,8 @@ class SceneEncoder:
                 f"({self._last_pts_seconds} s); the capture's time stamps must rise."
             )
         state = state_of(scene)
-        coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
-        blocks: dict[FieldName, bytes] = {
-            row.name: pack_raw_block(row.name, state[row.name])
-            if coded is None
-            else pack_coded_block(row.name, coded[row.name])
-            for row in STATE_TABLE
-            if row.name in self._header.dynamic
-        }
+        coded = {} if self._compact is None else self._compact.encode(state, kind=kind, index=index)
+        blocks = pack_blocks({name: state[name] for name in self._header.dynamic}, coded)
         packet = packet_from_blocks(blocks, index=index, pts_seconds=pts_seconds, kind=kind)
         encoded = Encoded(packet, self._decoder.decode(packet))
         self._last_pts_seconds = pts_seconds

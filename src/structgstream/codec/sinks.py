@@ -4,9 +4,7 @@
 import io
 import math
 import os
-from collections.abc import Callable
-from contextlib import suppress
-from functools import partial
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,18 +35,17 @@ from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StorageError, StreamError
 
 
-class _Writer:
+class _RecordSink:
     """Appends records to an unbuffered binary file and keeps the index.
 
     ``_end`` advances in one step, after a record is completely on the disk. An exception at any time, Ctrl-C included,
-    leaves at most extra bytes after ``_end``, which the next write or :meth:`finish` replaces. What begins another
+    leaves at most extra bytes after ``_end``, which the next write or :meth:`close` replaces. What begins another
     period is written together with its first packet, so that no file ends with it in an orderly way.
     """
 
-    def __init__(self, file: BinaryIO, name: str, *, free: Callable[[], int | None] = lambda: None) -> None:
-        self._file = file
+    def __init__(self, name: str) -> None:
         self._name = name
-        self._free = free  # room on the disk
+        self._file: BinaryIO | None = None  # while the sink is open
         self._header_bytes = self._largest = 0
         self._end = 0
         self._entries = bytearray()  # packed INDEX_ENTRYs; those with an offset of _end or more were interrupted
@@ -56,36 +53,33 @@ class _Writer:
         self._init = b""  # of the period that the next packet begins
         self._failed = False
 
-    def continue_at(self, end: int, reader: StreamReader) -> None:
-        """Continue after byte ``end`` of a file with the packets of ``reader``."""
-        begun = {period.first_frame: period for period in reader.periods[1:]}
-        for info in reader.packets:
-            if (period := begun.get(info.index)) is not None:
-                self._entries += INDEX_ENTRY.pack(info.index, RecordType.INIT, period.offset)
-            self._entries += INDEX_ENTRY.pack(info.index, RECORD_TYPES[info.kind], info.offset)
-        self._period = reader.periods[-1].number
-        self._end = end
-        self._header_bytes = reader.periods[-1].bytes
-        self._file.truncate(end)
-
     def open(self, header: StreamHeader) -> int:
-        data = prefix(periods=header.periods, sound=header.sound is not None) + packed(
-            RecordType.INIT, pack_header(header)
-        )
-        self._header_bytes = self._append(data)
+        """Write the init record; returns the bytes it took."""
+        start = prefix(periods=header.periods, sound=header.sound is not None)
+        self._header_bytes = self._append(start + packed(RecordType.INIT, pack_header(header)))
         return self._header_bytes
 
     def begin(self, header: StreamHeader) -> int:
+        """Begin another period with the next packet; its init record is written with that.
+
+        Raises:
+            StreamError: the header's description is too long.
+        """
         self._init = packed(RecordType.INIT, pack_header(header), period=self._period + 1)
         return len(self._init)
 
     def write(self, packet: Packet) -> int:
+        """Append one packet; returns the bytes it took.
+
+        Raises:
+            StorageError: the packet cannot be written, or the disk is nearly full; earlier packets stay.
+        """
         assert packet.kind is PacketKind.KEY or not self._init, "a period begins with a key packet"
         kind, period = RECORD_TYPES[packet.kind], self._period + bool(self._init)
         record = packed(kind, packet.payload, period=period) + sound_record(packet)
         self._largest = max(self._largest, len(record))
         check_room(
-            self._free(),
+            self._free_bytes(),
             largest=self._largest,
             closing=max(self._header_bytes, len(self._init)) + len(self._entries) + 2 * INDEX_ENTRY.size,
             where=self._name,
@@ -98,13 +92,23 @@ class _Writer:
         self._init, self._period = b"", period
         return len(record)
 
-    def finish(self) -> None:
-        """Write index and footer and truncate the rest of an interrupted write; does nothing after a failed write."""
-        if self._failed:
-            return
-        self._frames()
-        self._append(pack_index(INDEX_ENTRY.iter_unpack(self._entries), self._end))
-        self._file.truncate(self._end)
+    def close(self) -> None:
+        """Write the index, unless a write has failed. A second call does nothing.
+
+        Raises:
+            StorageError: no room for the index; all frames are safe.
+        """
+        try:
+            if self._file is not None and not self._failed:
+                self._frames()
+                self._append(pack_index(INDEX_ENTRY.iter_unpack(self._entries), self._end))
+                self._file.truncate(self._end)
+        finally:
+            self._file = None
+
+    def _free_bytes(self) -> int | None:
+        """Room on the disk; None if that is not known."""
+        return None
 
     def _frames(self) -> int:
         """The number of whole packets; entries of an interrupted write are forgotten."""
@@ -114,26 +118,24 @@ class _Writer:
         return INDEX_ENTRY.unpack(self._entries[-size:])[0] + 1 if self._entries else 0
 
     def _append(self, data: bytes) -> int:
+        assert self._file is not None, "open() comes first"
         try:
             append_durably(self._file, data, end=self._end)
         except OSError as error:
             self._failed = True
             raise StorageError(
-                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). "
-                f"The {self._frames()} frames "
-                "before are safe in it; make room and continue with --resume."
+                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). The {self._frames()} "
+                "frames before are safe in it; make room and continue with --resume."
             ) from error
         self._end += len(data)
         return len(data)
 
 
 def readable_part(data: ByteSource, *, name: str) -> int | None:
-    """End of the last whole packet, before the index; None if there is no whole packet.
+    """End of the last whole packet, before the index; None if there is no whole packet. Raises StreamError if it is no
+    stream, of another major version, or damaged before whole frames, which writing would destroy.
 
     In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
-
-    Raises:
-        StreamError: not a stream, another major version, or damage before whole frames, which writing would destroy.
     """
     if may_be_prefix(data[: PREFIX.size + 1]):
         return None  # Cut within the prefix, or empty.
@@ -160,19 +162,18 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
     return end if frames else None
 
 
-class FileSink:
+class FileSink(_RecordSink):
     """A stream file. Every packet is on the disk when ``write`` returns; a failed write is truncated.
 
     From :meth:`open` to :meth:`close` no other sink, of this process or another, can write to the file.
     """
 
     def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
+        super().__init__(str(Path(path)))
         self.path = Path(path)
         self._overwrite = overwrite
         self._resumed: tuple[int, StreamReader] | None = None
         self._size = 0  # of the file that is resumed
-        self._writer: _Writer | None = None
-        self._file: BinaryIO | None = None
 
     @classmethod
     def resume(cls, path: Path | str) -> tuple["FileSink", StreamReader | None]:
@@ -215,9 +216,9 @@ class FileSink:
             )
         try:
             self._file = self._opened()
-            self._writer = _Writer(self._file, str(self.path), free=partial(free_bytes, self.path))
             if self._resumed is not None:
-                self._writer.continue_at(*self._resumed)
+                self._continue_at(*self._resumed)
+                self._file.truncate(self._end)
                 return 0
             if os.stat(self._file.fileno()).st_size:  # Devices have no size, and cannot be truncated.
                 self._file.truncate(0)
@@ -226,7 +227,25 @@ class FileSink:
             raise StorageError(
                 f"Cannot open {self.path} for writing ({error.strerror}); choose another place or mend its permissions."
             ) from error
-        return self._writer.open(header)
+        return super().open(header)
+
+    def close(self) -> None:
+        """As of every sink; the file is closed in any case."""
+        with self._file or nullcontext():
+            super().close()
+
+    def _continue_at(self, end: int, reader: StreamReader) -> None:
+        """Continue after byte ``end`` of the file with the packets of ``reader``."""
+        begun = {period.first_frame: period for period in reader.periods[1:]}
+        for info in reader.packets:
+            if (period := begun.get(info.index)) is not None:
+                self._entries += INDEX_ENTRY.pack(info.index, RecordType.INIT, period.offset)
+            self._entries += INDEX_ENTRY.pack(info.index, RECORD_TYPES[info.kind], info.offset)
+        self._period, self._header_bytes = reader.periods[-1].number, reader.periods[-1].bytes
+        self._end = end
+
+    def _free_bytes(self) -> int | None:
+        return free_bytes(self.path)
 
     def _opened(self) -> BinaryIO:
         """The file, locked before anything in it is changed."""
@@ -247,45 +266,13 @@ class FileSink:
         if not lock_file(file):
             raise StorageError(f"Another process writes to {self.path}; wait for its end, or choose another name.")
 
-    def begin(self, header: StreamHeader) -> int:
-        """Begin another period with the next packet; its init record is written with that.
 
-        Raises:
-            StreamError: the header's description is too long.
-        """
-        assert self._writer is not None, "open() comes before begin()"
-        return self._writer.begin(header)
-
-    def write(self, packet: Packet) -> int:
-        """Append one packet; returns the bytes it took.
-
-        Raises:
-            StorageError: the packet cannot be written, or the disk is nearly full; earlier packets stay.
-        """
-        assert self._writer is not None, "open() comes before write()"
-        return self._writer.write(packet)
-
-    def close(self) -> None:
-        """Write the index, unless a write has failed, and close the file. A second call does nothing.
-
-        Raises:
-            StorageError: no room for the index; all frames are safe.
-        """
-        if self._writer is None or self._file is None:
-            return
-        writer, file = self._writer, self._file
-        self._writer = self._file = None
-        with file:
-            writer.finish()
-
-
-class MemorySink:
+class MemorySink(_RecordSink):
     """A stream in memory; :attr:`data` equals the content of a file."""
 
     def __init__(self) -> None:
+        super().__init__("memory")
         self._buffer = io.BytesIO()
-        self._writer = _Writer(self._buffer, "memory")
-        self._open = False
 
     @property
     def data(self) -> bytes:
@@ -293,24 +280,9 @@ class MemorySink:
         return self._buffer.getvalue()
 
     def open(self, header: StreamHeader) -> int:
-        """Write the init record."""
-        size = self._writer.open(header)
-        self._open = True
-        return size
-
-    def begin(self, header: StreamHeader) -> int:
-        """Begin another period with the next packet."""
-        return self._writer.begin(header)
-
-    def write(self, packet: Packet) -> int:
-        """Append one packet; returns the bytes it took."""
-        return self._writer.write(packet)
-
-    def close(self) -> None:
-        """Write the index. A second call does nothing."""
-        if self._open:
-            self._open = False
-            self._writer.finish()
+        """Write the init record; returns the bytes it took."""
+        self._file = self._buffer
+        return super().open(header)
 
 
 class StoredPackets(Packets):
@@ -345,14 +317,9 @@ class StoredSegments(StreamReader):
 def resume_segments(
     store: Store, *, options: SegmentsOptions | None = None, clocks: Clocks | None = None
 ) -> tuple[SegmentsSink, StoredSegments | None]:
-    """A sink that continues a stream of segments after its last written frame, and its existing frames.
-
-    They are None if there is no whole frame: the stream then begins again. Nothing is changed before the sink is
-    opened.
-
-    Raises:
-        StreamError: the stream is damaged so that it cannot be continued.
-    """
+    """A sink that continues a stream of segments after its last written frame, and its existing frames; None if there
+    is no whole one: the stream then begins again. Nothing is changed before the sink is opened. Raises StreamError if
+    the stream is damaged so that it cannot be continued."""
     found = find(store)
     sink = SegmentsSink(store, overwrite=True, options=options, clocks=clocks, found=found)
     if found is None:

@@ -26,11 +26,8 @@ class SoundFormat:
 
 
 def sound_format(value: Any) -> SoundFormat | None:
-    """The sound that a description states; None if there is none, or of a codec that this version does not know.
-
-    Raises:
-        ValueError: it contradicts the format.
-    """
+    """The sound that a description states; None if there is none, or of a codec that this version does not know. Raises
+    ValueError if it contradicts the format."""
     if value is None:
         return None
     if not isinstance(value, dict) or not isinstance(value.get("codec"), str):
@@ -63,11 +60,7 @@ class FrameSound:
 
 
 def unpack_sound(payload: bytes) -> FrameSound:
-    """The sound in a sound record.
-
-    Raises:
-        StreamError: the payload violates the format.
-    """
+    """The sound in a sound record. Raises StreamError if the payload violates the format."""
     if len(payload) < _HEAD.size:
         raise StreamError("A sound record is too short to hold its frame and time.")
     index, seconds, count = _HEAD.unpack_from(payload)

@@ -20,7 +20,7 @@ from structgstream.codec.container.records import (
 )
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StreamError
-from tests.support.streams import same, small_stream
+from tests.support.streams import flipped, same, small_stream
 
 STREAM = small_stream()
 RECORDS = list(scan_records(STREAM))
@@ -62,7 +62,6 @@ def test_by_index_everything_is_the_same() -> None:
 def test_by_index_packets_are_not_read() -> None:
     data = Counted(STREAM)
     index = read_index(data, START)
-    assert index is not None
     assert [*index[0]] == [offset for _, _, offset in ENTRIES]
     assert data.read < 200 < min(len(record.payload) for record in RECORDS[1:5])
 
@@ -72,7 +71,6 @@ def test_records_of_unknown_types_lie_between_packets() -> None:
     moved = [*ENTRIES[:1], *((i, kind, offset + 15) for i, kind, offset in ENTRIES[1:])]
     data = with_index(body + STREAM[RECORDS[2].offset : RECORDS[5].offset], moved)
     index = read_index(data, START)
-    assert index is not None
     assert [*index[0]] == [offset for _, _, offset in moved]
 
 
@@ -126,10 +124,8 @@ def test_records_that_contradict_each_other_are_left_to_the_scan(records: list[b
 
 
 def test_damage_shows_where_it_is_when_the_scene_is_asked_for(tmp_path: Path) -> None:
-    data = bytearray(STREAM)
-    data[ENTRIES[1][2] + 40] ^= 1
     path = tmp_path / "damaged.sgs"
-    path.write_bytes(data)
+    path.write_bytes(flipped(STREAM, 8 * (ENTRIES[1][2] + 40)))
     reader = open_stream(path, by_index=True)
     assert (len(reader), len(open_stream(path))) == (4, 1)
     assert same(reader.scene(0), StreamReader(STREAM).scene(0))

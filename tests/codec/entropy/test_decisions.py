@@ -18,10 +18,10 @@ from structgstream.codec.entropy.decisions import (
     code_residuals,
     residual_contexts,
 )
-from structgstream.codec.entropy.rans import has_native
+from structgstream.codec.entropy.rans import uses_native
 from tests.support.properties import examples
 
-NATIVE = [False, *([True] if has_native() else [])]
+NATIVE = [False, *([True] if uses_native() else [])]
 both = pytest.mark.parametrize("native", NATIVE)
 NUMBER = st.one_of(st.integers(-9, 9), st.integers(-(2**31) + 1, 2**31 - 1))
 
@@ -33,12 +33,22 @@ def coded_numbers(values: list[int], *, native: bool, flags: bool = False) -> tu
     return code.finished(), model
 
 
+def decoded_numbers(
+    data: bytes, count: int, *, native: bool, flags: bool = False
+) -> tuple[list[int] | None, ArithmeticState]:
+    """The numbers, None if one is out of bounds, and the code after them."""
+    model, code = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES), ArithmeticState(data)
+    found = np.zeros(count, np.int64)
+    sound = code_numbers(code, model, contexts=contexts_for([0] * count), values=found, flags=flags, native=native)
+    return found.tolist() if sound else None, code
+
+
 def contexts_for(values: list[int]) -> np.ndarray:
     places = np.arange(len(values), dtype=np.int32)
     return np.stack([places % 2, places % 3, 0 * places], axis=1)
 
 
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.skipif(not uses_native(), reason="the native library has no entropy coder")
 @examples(60)
 @given(st.lists(NUMBER, max_size=40), st.booleans())
 def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> None:
@@ -48,15 +58,13 @@ def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> 
     for name in ("chances", "seen", "weights"):
         assert (getattr(mine, name) == getattr(its, name)).all()
     for native in NATIVE:
-        code, found = ArithmeticState(one), np.zeros(len(values), np.int64)
-        model = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES)
-        assert code_numbers(code, model, contexts=contexts_for(values), values=found, flags=flags, native=native)
-        assert found.tolist() == values
+        found, code = decoded_numbers(one, len(values), native=native, flags=flags)
+        assert found == values
         assert code.is_exhausted() or not values
         assert not code.is_overrun()
 
 
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.skipif(not uses_native(), reason="the native library has no entropy coder")
 @examples(25)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
 def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
@@ -67,18 +75,17 @@ def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
     values, last = (np.rint(g.laplace(0, g.choice([0.5, 9, 1e5]), (rows, 3))).astype(np.int32) for _ in range(2))
     found = []
     for native in NATIVE:
-        blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
-        model, code = Model.new(residual_contexts(3), nodes=NUMBER_NODES), ArithmeticState(None)
-        code_activity(code, (blocks, its_rows), history=history, sizes=sizes, active=active.copy(), native=native)
-        assert code_residuals(code, model, last=last, others=sizes, residuals=values.copy(), native=native)
-        data = code.finished()
-        found.append([data, blocks.chances.tolist(), its_rows.weights.tolist(), model.chances.tolist()])
-        again = ArithmeticState(data)
-        blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
-        model, back, residuals = Model.new(residual_contexts(3), nodes=NUMBER_NODES), 0 * active, 0 * values
-        code_activity(again, (blocks, its_rows), history=history, sizes=sizes, active=back, native=native)
-        assert code_residuals(again, model, last=last, others=sizes, residuals=residuals, native=native)
-        assert again.is_exhausted() or not rows
+        code, back, residuals = ArithmeticState(None), active.copy(), values.copy()
+        for decodes in (False, True):
+            blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
+            model = Model.new(residual_contexts(3), nodes=NUMBER_NODES)
+            code_activity(code, (blocks, its_rows), history=history, sizes=sizes, active=back, native=native)
+            assert code_residuals(code, model, last=last, others=sizes, residuals=residuals, native=native)
+            if not decodes:
+                data = code.finished()
+                found.append([data, blocks.chances.tolist(), its_rows.weights.tolist(), model.chances.tolist()])
+                code, back, residuals = ArithmeticState(data), 0 * active, 0 * values
+        assert code.is_exhausted() or not rows
         assert (back == active).all()
         assert (residuals == values).all()
     assert found[0] == found[-1]
@@ -106,10 +113,7 @@ def test_carries_run_through_many_bytes(native: bool) -> None:
         g = np.random.default_rng(seed)
         values = [*([1] * 400), *g.integers(0, 2, 5).tolist(), *([0] * int(g.integers(1, 60)))]
         data, _ = coded_numbers(values, native=native, flags=True)
-        code, found = ArithmeticState(data), np.zeros(len(values), np.int64)
-        model = Model.new([2, 3, 1], nodes=1)
-        code_numbers(code, model, contexts=contexts_for(values), values=found, flags=True, native=native)
-        assert found.tolist() == values
+        assert decoded_numbers(data, len(values), native=native, flags=True)[0] == values
 
 
 @both
@@ -117,10 +121,8 @@ def test_a_code_that_is_cut_or_goes_on_is_not_whole(native: bool) -> None:
     values = np.random.default_rng(3).integers(-5, 6, 60).tolist()
     data, _ = coded_numbers(values, native=native)
     for other in (data + b"\0", data[:-2], b""):
-        code, found = ArithmeticState(other), np.zeros(60, np.int64)
-        model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
-        code_numbers(code, model, contexts=contexts_for(values), values=found, native=native)
-        assert not code.is_exhausted() or found.tolist() != values
+        found, code = decoded_numbers(other, 60, native=native)
+        assert not code.is_exhausted() or found != values
     assert ArithmeticState(b"").is_exhausted()
     assert not ArithmeticState(b"\0").is_exhausted()
 
@@ -130,10 +132,8 @@ def test_any_bytes_are_numbers_or_damage(native: bool) -> None:
     """Bits that always say yes make the largest number there is, which is refused."""
     g = np.random.default_rng(4)
     for data in (b"", bytes(40), b"\xff" * 40, *(g.bytes(30) for _ in range(50))):
-        code, found = ArithmeticState(data), np.zeros(50, np.int64)
-        model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
-        if code_numbers(code, model, contexts=contexts_for([0] * 50), values=found, native=native):
-            assert (np.abs(found) < 2**31).all()
+        found, _ = decoded_numbers(data, 50, native=native)
+        assert all(abs(number) < 2**31 for number in found or ())
 
 
 def test_squash_and_stretch_belong_together() -> None:

@@ -17,14 +17,14 @@ from structgstream.codec.entropy.rans import (
     SectionEncoder,
     decode,
     encode,
-    has_native,
     lanes_for,
+    uses_native,
 )
 from structgstream.codec.entropy.tables import FrequencyTables, geometric_family, normalize_counts
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 
-NATIVE = [False, *([True] if has_native() else [])]
+NATIVE = [False, *([True] if uses_native() else [])]
 both = pytest.mark.parametrize("native", NATIVE, ids=lambda native: "C++" if native else "NumPy")
 
 
@@ -34,17 +34,9 @@ def drawn(seed: int, *, count: int, contexts: int = 5, alphabet: int = 16, even:
     context = g.integers(0, contexts, count).astype(np.uint16)
     spread = np.linspace(0.3, 3.0, contexts)[context]
     symbol = g.integers(0, alphabet, count) if even else np.minimum(g.geometric(1 / (1 + spread)) - 1, alphabet - 1)
-    return (
-        symbol.astype(np.uint8),
-        context,
-        normalize_counts(counted(symbol, context, contexts=contexts, alphabet=alphabet)),
-    )
-
-
-def counted(symbols: np.ndarray, context: np.ndarray, *, contexts: int, alphabet: int) -> np.ndarray:
     counts = np.zeros((contexts, alphabet), np.int64)
-    np.add.at(counts, (context, symbols), 1)
-    return counts
+    np.add.at(counts, (context, symbol), 1)
+    return symbol.astype(np.uint8), context, normalize_counts(counts)
 
 
 @both
@@ -78,7 +70,7 @@ def test_any_table_codes_what_it_has_a_frequency_for(native, data: st.DataObject
     assert (found == symbols).all()
 
 
-@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.skipif(not uses_native(), reason="the native library has no entropy coder")
 @pytest.mark.parametrize("count", [1, 31, 33, 999, 5000])
 @pytest.mark.parametrize("lanes", LANES)
 def test_both_coders_write_the_same_bytes_and_read_each_other(count: int, lanes: int) -> None:

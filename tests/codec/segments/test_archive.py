@@ -11,7 +11,7 @@ from structgstream.codec.segments.stored_bytes import read_manifest, write_archi
 from structgstream.errors import StreamError
 from tests.support.segment_folders import GrowingFolder
 from tests.support.segment_streams import folder, packets, written
-from tests.support.streams import small_stream
+from tests.support.streams import flipped, small_stream
 
 SENT = packets(7)
 
@@ -37,9 +37,8 @@ def test_what_was_there_stays_when_a_file_is_damaged(store: FolderStore, tmp_pat
     (tmp_path / "a.sgs").write_bytes(b"an earlier archive")
     manifest = read_manifest(store)
     name = manifest.periods[0].file if which == "init" else manifest.segments[-1].file
-    data = bytearray(store.get(name))
-    data[len(data) // 2] ^= 1
-    store.put(name, bytes(data))
+    data = store.get(name)
+    store.put(name, flipped(data, len(data) // 2 * 8))
     with pytest.raises(StreamError, match=f"{name} in .* is damaged"):
         write_archive(store, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == b"an earlier archive"

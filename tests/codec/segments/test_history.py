@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The manifest of a stream that runs for weeks stays small, and every segment is found again."""
 
+from pathlib import Path
+
 import pytest
 
 from structgstream.codec.packets import PacketKind
@@ -12,61 +14,25 @@ from structgstream.codec.segments.manifest import (
     PeriodEntry,
     SegmentEntry,
     Window,
-    init_name,
+    file_name,
     manifest_from_json,
     manifest_to_json,
-    part_name,
-    segment_name,
-    sha256_of,
 )
+from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import paged, segments_from
 from structgstream.errors import StreamError
-
-SHA = sha256_of(b"")
-
-
-class Memory:
-    """A store without a disk."""
-
-    name = "memory"
-
-    def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
-
-    def put(self, name: str, data: bytes) -> None:
-        self.files[name] = data
-
-    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        return self.files[name]
-
-    def delete(self, name: str) -> None:
-        del self.files[name]
-
-    def names(self) -> frozenset[str]:
-        return frozenset(self.files)
-
-    def free_bytes(self) -> int | None:
-        return None
+from tests.support.segment_streams import SHA256, segment_entry
 
 
-def segment(number: int, frames: int) -> SegmentEntry:
-    sizes = (123_456, *[45_678] * (frames - 1))
-    first = number * frames
-    return SegmentEntry(
-        number, segment_name(number, SHA), 0, first, frames, (first / 30, (first + frames - 1) / 30), sum(sizes),
-        sizes[0], sizes, SHA,
-    )  # fmt: skip
-
-
-def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
+def grown(folder: Path, segments: int, frames: int) -> tuple[tuple[HistoryEntry, ...], tuple[SegmentEntry, ...], int]:
     """History and segments after as many groups, and the longest that both together were as JSON."""
     history: tuple[HistoryEntry, ...] = ()
     listed: tuple[SegmentEntry, ...] = ()
     longest = 0
     for number in range(segments):
-        found = paged(history, (*listed, segment(number, frames)))
+        found = paged(history, (*listed, segment_entry(number, frames=frames, sizes=(123_456, 45_678))))
         for name, data in found.pages:
-            store.put(name, data)
+            (folder / name).write_bytes(data)
         history, listed = found.history, found.segments
         if number % 61 == 60:
             longest = max(longest, len(manifest_to_json(manifest(history, listed, frames))))
@@ -76,19 +42,19 @@ def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry
 def manifest(history: tuple[HistoryEntry, ...], listed: tuple[SegmentEntry, ...], frames: int) -> Manifest:
     first = listed[-1].first_frame + frames
     parts = tuple(
-        PartEntry(part_name(first + i, SHA), first + i, 0, kind, (first + i) / 30, 45_678, SHA)
+        PartEntry(file_name("part", first + i, SHA256), first + i, 0, kind, (first + i) / 30, 45_678, SHA256)
         for i, kind in enumerate((PacketKind.KEY, *[PacketKind.DELTA] * (frames - 1)))
     )
     edge = Edge(first + frames - 1, parts[-1].pts_seconds, 1.7e9, 1.7e9)
-    period = PeriodEntry(0, init_name(0, SHA), 800_000, SHA, 0, 0)
+    period = PeriodEntry(0, file_name("init", 0, SHA256), 800_000, SHA256, 0, 0)
     return Manifest(9, True, 30.0, "x", 2.0, 1.0, edge, Window(0, 0, None), (period,), history, listed, parts)
 
 
 @pytest.mark.parametrize(("segments", "frames"), [(33_000, 3), (2_000, 90)])
-def test_a_manifest_stays_below_50_kb_and_everything_is_found(segments: int, frames: int) -> None:
+def test_a_manifest_stays_below_50_kb_and_everything_is_found(tmp_path: Path, segments: int, frames: int) -> None:
     """After 33000 groups the third level is reached; long groups have long entries."""
-    store = Memory()
-    history, listed, longest = grown(store, segments, frames)
+    store = FolderStore(tmp_path)
+    history, listed, longest = grown(tmp_path, segments, frames)
     assert longest < 50_000
     whole = manifest(history, listed, frames)
     assert manifest_from_json(manifest_to_json(whole), name="x") == whole
@@ -96,16 +62,17 @@ def test_a_manifest_stays_below_50_kb_and_everything_is_found(segments: int, fra
     late = segments - 1_500
     assert [entry.segment for entry in segments_from(store, history, listed, first=late)] == [*range(late, segments)]
     assert next(segments_from(store, history, listed)).segment == 0
-    assert all(len(data) < 50_000 for data in store.files.values())
+    assert all(path.stat().st_size < 50_000 for path in tmp_path.iterdir())
 
 
-def test_a_page_that_was_changed_is_refused() -> None:
-    store = Memory()
-    history, listed, _ = grown(store, 100, 3)
-    name = history[0].file
-    store.files[name] = store.files[name].replace(b"45678", b"45679")
-    with pytest.raises(StreamError, match=f"{name} in memory is damaged"):
-        list(segments_from(store, history, listed))
-    store.files[name] += b" "
-    with pytest.raises(StreamError, match="the manifest states"):
-        list(segments_from(store, history, listed))
+def test_a_page_that_was_changed_is_refused(tmp_path: Path) -> None:
+    history, listed, _ = grown(tmp_path, 100, 3)
+    page = tmp_path / history[0].file
+    data = page.read_bytes()
+    for changed, message in (
+        (data.replace(b"45678", b"45679"), f"{page.name} in {tmp_path} is damaged"),
+        (data + b" ", "the manifest states"),
+    ):
+        page.write_bytes(changed)
+        with pytest.raises(StreamError, match=message):
+            list(segments_from(FolderStore(tmp_path), history, listed))

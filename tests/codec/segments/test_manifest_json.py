@@ -3,6 +3,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,40 +21,26 @@ from structgstream.codec.segments.manifest import (
     Manifest,
     PartEntry,
     PeriodEntry,
-    SegmentEntry,
     Window,
-    history_name,
-    init_name,
+    file_name,
     manifest_from_json,
     manifest_to_json,
     page_from_json,
     page_to_json,
-    part_name,
-    segment_name,
     sha256_of,
 )
 from structgstream.errors import StreamError
+from tests.support.segment_streams import SHA256, segment_entry
 
-SHA = sha256_of(b"something")
 VECTORS = Path(__file__).parents[2] / "vectors"
 GOLDEN = (VECTORS / "segments-1" / "manifest.json").read_bytes()
 RULES: list[dict[str, Any]] = json.loads((VECTORS / "manifest-rules.json").read_text())
 
 
-def segment(number: int, frames: int = 3) -> SegmentEntry:
-    """A segment of as many frames as each before it."""
-    first = number * frames
-    sizes = (100, *[10] * (frames - 1))
-    name = segment_name(number, SHA)
-    return SegmentEntry(
-        number, name, 0, first, frames, (first / 30, (first + frames - 1) / 30), sum(sizes), 100, sizes, SHA
-    )
-
-
 def manifest() -> Manifest:
     """One page of two segments, two segments, two parts."""
-    page = page_to_json([segment(0), segment(1)])
-    name = history_name(0, sha256_of(page))
+    page = page_to_json([segment_entry(0), segment_entry(1)])
+    name = file_name("history", 0, sha256_of(page))
     return Manifest(
         sequence=12,
         live=True,
@@ -63,18 +50,27 @@ def manifest() -> Manifest:
         frame_seconds=None,
         edge=Edge(13, 13 / 30, None, 1.7e9 + 0.1),
         window=Window(0, 0, None),
-        periods=(PeriodEntry(0, init_name(0, SHA), 812_345, SHA, 0, 0),),
+        periods=(PeriodEntry(0, file_name("init", 0, SHA256), 812_345, SHA256, 0, 0),),
         history=(HistoryEntry(name, 0, 0, 2, 0, 6, (0.0, 5 / 30), len(page), sha256_of(page)),),
-        segments=(segment(2), segment(3)),
+        segments=(segment_entry(2), segment_entry(3)),
         parts=(
-            PartEntry(part_name(12, SHA), 12, 0, PacketKind.KEY, 12 / 30, 90, SHA),
-            PartEntry(part_name(13, SHA), 13, 0, PacketKind.DELTA, 13 / 30, 9, SHA),
+            PartEntry(file_name("part", 12, SHA256), 12, 0, PacketKind.KEY, 12 / 30, 90, SHA256),
+            PartEntry(file_name("part", 13, SHA256), 13, 0, PacketKind.DELTA, 13 / 30, 9, SHA256),
         ),
     )
 
 
 def read(data: bytes) -> Manifest:
     return manifest_from_json(data, name="manifest.json")
+
+
+def changed(data: bytes, path: Sequence[Any], value: Any) -> Any:
+    """JSON with another value at a place."""
+    plain = place = json.loads(data)
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return plain
 
 
 def test_a_manifest_comes_back_and_equal_ones_are_equal_bytes() -> None:
@@ -87,19 +83,15 @@ def test_a_manifest_comes_back_and_equal_ones_are_equal_bytes() -> None:
 
 
 def test_pages_come_back_and_pages_of_pages() -> None:
-    first, second = [segment(0), segment(1)], [segment(2)]
-    pages = []
-    for entries in (first, second):
-        data, frames = page_to_json(entries), sum(entry.frames for entry in entries)
-        pages.append(
-            HistoryEntry(
-                "h.json", 0, entries[0].segment, len(entries), entries[0].first_frame, frames,
-                (entries[0].pts_seconds[0], entries[-1].pts_seconds[1]), len(data), SHA,
-            )
-        )  # fmt: skip
-        assert page_from_json(data, pages[-1]) == tuple(entries)
+    first, second = [segment_entry(0), segment_entry(1)], [segment_entry(2)]
+    pages = [
+        HistoryEntry("h.json", 0, 0, 2, 0, 6, (0.0, 5 / 30), 1, SHA256),
+        HistoryEntry("h.json", 0, 2, 1, 6, 3, (6 / 30, 8 / 30), 1, SHA256),
+    ]
+    for entries, page in zip((first, second), pages):
+        assert page_from_json(page_to_json(entries), page) == tuple(entries)
     data = page_to_json(pages)
-    above = HistoryEntry("hh.json", 1, 0, 3, 0, 9, (0.0, 8 / 30), len(data), SHA)
+    above = HistoryEntry("hh.json", 1, 0, 3, 0, 9, (0.0, 8 / 30), len(data), SHA256)
     assert page_from_json(data, above) == tuple(pages)
     with pytest.raises(StreamError, match="hh.json has 3 segments of 9 frames; expected 4 of 9"):
         page_from_json(data, replace(above, segments=4))
@@ -142,13 +134,8 @@ BAD: list[tuple[tuple[Any, ...], Any, str]] = [
 
 @pytest.mark.parametrize(("path", "value", "message"), BAD, ids=[f"{path}={str(v)[:12]}" for path, v, _ in BAD])
 def test_what_contradicts_the_format_is_refused_in_words(path: tuple[Any, ...], value: Any, message: str) -> None:
-    plain = json.loads(manifest_to_json(manifest()))
-    place = plain
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
     with pytest.raises(StreamError, match=message):
-        read(json.dumps(plain).encode())
+        read(json.dumps(changed(manifest_to_json(manifest()), path, value)).encode())
 
 
 @pytest.mark.parametrize(
@@ -179,11 +166,7 @@ def test_a_manifest_that_has_ended_has_no_parts_and_what_is_missing_is_named() -
 @pytest.mark.parametrize("rule", RULES, ids=[f"{rule['at']} {rule['json'][:24]}" for rule in RULES])
 def test_the_rules_that_the_player_follows_too(rule: dict[str, Any]) -> None:
     """viewer/packages/player/test/manifest.test.ts reads the same cases."""
-    plain = json.loads(GOLDEN)
-    place = plain
-    for key in rule["at"][:-1]:
-        place = place[key]
-    place[rule["at"][-1]] = "@"
+    plain = changed(GOLDEN, rule["at"], "@")
     value = re.sub(r"<(.+?)\*(\d+)>", lambda found: found[1] * int(found[2]), rule["json"])
     data = json.dumps(plain).replace('"@"', value).encode()
     if rule["taken"]:

@@ -12,7 +12,7 @@ from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
-from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError
 from structgstream.owned_folders import MARKER
@@ -57,18 +57,21 @@ class Remote(FolderStore):
             raise StorageError("No route to host.")
 
 
-def named(store: FolderStore) -> dict[str, bytes]:
+def named(store: Store) -> dict[str, bytes]:
     """What the manifest names, and itself."""
     there = store.names()
     return {name: store.get(name) for name in there - stale_files(read_manifest(store), there)}
 
 
+def check_copied(mirror: MirroredStore) -> None:
+    assert mirror.finish(wait_seconds=60) == 0
+    assert named(mirror._remote) == named(mirror._folder)
+
+
 def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> None:
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
-    mirror = MirroredStore(here, remote)
-    written(mirror, SENT)
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    written(mirror := MirroredStore(here, remote), SENT)
+    check_copied(mirror)
     assert remote.edges == sorted(remote.edges)
     assert remote.edges[-1] == 8
     stored = StoredBytes(remote, read_manifest(remote), check=True)
@@ -86,8 +89,7 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     assert read_manifest(here).edge.frame == 8
     assert remote.edges == []
     remote.reachable.set()
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    check_copied(mirror)
     assert remote.edges == [8]  # Those before were replaced while they waited.
     assert len(reported) == 2
     assert "cannot be reached (No route to host.); the stream goes on in" in reported[0]
@@ -97,23 +99,20 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
 def test_what_was_not_copied_is_reported_and_copied_by_the_next_run(tmp_path: Path) -> None:
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     remote.reachable.clear()
-    mirror = MirroredStore(here, remote)
-    written(mirror, SENT)
+    written(mirror := MirroredStore(here, remote), SENT)
     assert mirror.finish(wait_seconds=0.0) > 0
     remote.reachable.set()
     (remote.folder / "notes.txt").write_text("mine")
     again = MirroredStore(here, remote)
     again.copy_all()
-    assert again.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    check_copied(again)
     assert (remote.folder / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize("marked", [True, False])
 def test_another_stream_is_never_replaced(tmp_path: Path, marked: bool) -> None:
     remote = Remote(tmp_path / "remote")
-    first = MirroredStore(folder(tmp_path / "first"), remote)
-    written(first, packets(4))
+    written(first := MirroredStore(folder(tmp_path / "first"), remote), packets(4))
     assert first.finish(wait_seconds=60) == 0
     if not marked:
         (remote.folder / MARKER).unlink()
@@ -125,8 +124,7 @@ def test_another_stream_is_never_replaced(tmp_path: Path, marked: bool) -> None:
 
 def test_another_stream_that_is_found_after_an_outage_is_not_replaced(tmp_path: Path) -> None:
     remote, reported = Remote(tmp_path / "remote"), list[str]()
-    first = MirroredStore(folder(tmp_path / "first"), remote)
-    written(first, packets(4))
+    written(first := MirroredStore(folder(tmp_path / "first"), remote), packets(4))
     assert first.finish(wait_seconds=60) == 0
     before = contents(remote)
     options = MirrorOptions(grace_seconds=0.0, report=reported.append)
@@ -145,8 +143,7 @@ def contents(store: FolderStore) -> dict[str, bytes]:
 
 def test_a_copy_without_a_marker_is_known_by_its_first_record(tmp_path: Path) -> None:
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
-    mirror = MirroredStore(here, remote)
-    written(mirror, SENT)
+    written(mirror := MirroredStore(here, remote), SENT)
     assert mirror.finish(wait_seconds=60) == 0
     for store in (here, remote):
         (store.folder / MARKER).unlink()
@@ -183,8 +180,7 @@ def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(
     mirror = MirroredStore(here, remote)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5), hands=hands)
     remote.reachable.set()
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    check_copied(mirror)
     assert not {int(name.split("-")[1]) for name in remote.names() if "part" in name} & {0, 1, 2}
 
 
@@ -230,8 +226,7 @@ def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path)
     written(mirror, SENT, after=after)
     assert remote.refused.acquire(timeout=60)
     remote.reachable.set()
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    check_copied(mirror)
 
 
 @pytest.mark.parametrize("frame", [2, 3])
@@ -242,10 +237,8 @@ def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
     names = sorted(here.names() - {MANIFEST})
     for name in names[: frame + 1]:
         FolderStore.put(remote, name, here.get(name))
-    mirror = MirroredStore(here, remote)
-    written(mirror, SENT)
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    written(mirror := MirroredStore(here, remote), SENT)
+    check_copied(mirror)
 
 
 def test_after_an_outage_only_what_is_named_is_copied(tmp_path: Path) -> None:
@@ -302,8 +295,7 @@ def test_a_store_that_is_filled_again_keeps_its_manifest(tmp_path: Path) -> None
         hands.wait(1.0)
         StoredBytes(remote, read_manifest(remote), check=True)[:]
     sink.close()
-    assert mirror.finish(wait_seconds=60) == 0
-    assert named(remote) == named(here)
+    check_copied(mirror)
 
 
 def test_what_comes_again_while_its_removal_waits_for_a_round_stays(tmp_path: Path) -> None:

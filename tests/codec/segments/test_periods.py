@@ -16,25 +16,16 @@ from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StreamError
 from tests.support.period_streams import FIRSTS, FRAMES, period_of, period_packets, period_stream
-from tests.support.segment_streams import Hands, Killed, KilledStore, folder
+from tests.support.segment_streams import Hands, Killed, KilledStore, folder, written
 from tests.support.streams import same
 
 
 def write(
     store: Store, *, stop: int = FRAMES, options: SegmentsOptions | None = None, hands: Hands | None = None
 ) -> None:
-    """Write the stream up to before frame ``stop``, or what is missing of it, as a session does."""
-    hands = hands or Hands()
+    """Write the stream up to before frame ``stop``, or what is missing of it."""
     headers, packets, _ = period_packets(codec="raw")
-    sink, resumed = resume_segments(store, options=options, clocks=hands.clocks())
-    start = 0 if resumed is None else len(resumed)
-    sink.open(headers[0] if resumed is None else resumed.header_of(start - 1))
-    for packet in packets[start:stop]:
-        hands.wait(1.0)
-        if packet.index and packet.index in FIRSTS:
-            sink.begin(headers[FIRSTS.index(packet.index)])
-        sink.write(packet)
-    sink.close()
+    written(store, packets[:stop], options=options, hands=hands, periods=dict(zip(FIRSTS, headers)))
 
 
 def inits(store: FolderStore) -> list[str]:
@@ -130,12 +121,10 @@ def test_with_a_window_what_nobody_needs_goes(tmp_path: Path, stops: tuple[int, 
     manifest = read_manifest(store)
     assert [one.period for one in manifest.periods] == [2]
     assert len(inits(store)) == 1
-    sink, resumed = resume_segments(store, options=options)
-    assert resumed is not None
+    _, resumed = resume_segments(store, options=options)
     assert (len(resumed), resumed.period(FRAMES - 1).first_frame) == (FRAMES, 9)
     assert same(resumed.scene(FRAMES - 1), period_stream(codec="raw")[1][FRAMES - 1])
     assert same(resumed.scene(9), period_stream(codec="raw")[1][9])
     segments = sorted(name for name in store.names() if name.startswith("segment-"))
     assert [int(name.split("-")[1]) for name in segments] == [5, 6]
-    assert sink is not None
     assert [resumed.period(index).number for index in range(FRAMES)] == [period_of(index) for index in range(FRAMES)]

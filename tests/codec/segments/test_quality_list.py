@@ -58,12 +58,6 @@ def test_what_is_no_list_is_refused(changed: dict[str, object], said: str) -> No
         list_from_json(json.dumps(values).encode(), name="x")
 
 
-def test_a_list_that_is_a_folder_cannot_be_read(tmp_path: Path) -> None:
-    (tmp_path / QUALITIES).mkdir()
-    with pytest.raises(StreamError, match="Cannot read"):
-        read_list(tmp_path)
-
-
 def test_which_folder_a_quality_is() -> None:
     assert (LOW.folder, ListedQuality("x", "a/b/manifest.json", 1.0).folder) == ("low", None)
     assert ListedQuality("x", "manifest.json", 1.0).folder is None

@@ -6,22 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, Window, segment_name
+from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, Window
 from structgstream.codec.segments.recovery import empty_manifest
 from structgstream.codec.segments.sink import Retention, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from tests.support.segment_streams import folder, header
+from tests.support.segment_streams import SHA256, folder, header, segment_entry
 
-SHA = "0" * 64
-FIRST = PeriodEntry(0, "init-0000-0123456789abcdef.sgs", 10, SHA, 0, 0)
-SECOND = PeriodEntry(1, "init-0001-0123456789abcdef.sgs", 10, SHA, 12, 4)
+FIRST = PeriodEntry(0, "init-0000-0123456789abcdef.sgs", 10, SHA256, 0, 0)
+SECOND = PeriodEntry(1, "init-0001-0123456789abcdef.sgs", 10, SHA256, 12, 4)
 
 
 def segment(number: int) -> SegmentEntry:
     """Three frames, a second apart."""
-    first = 3 * number
-    name = segment_name(number, SHA)
-    return SegmentEntry(number, name, 0, first, 3, (float(first), first + 2.0), 30, 10, (10, 10, 10), SHA)
+    return segment_entry(number, fps=1.0)
 
 
 def manifest(segments: int, *, periods: tuple[PeriodEntry, ...] = (FIRST,), after: Manifest | None = None) -> Manifest:
@@ -72,7 +69,6 @@ def test_what_a_stream_that_is_taken_up_needed_goes_when_another_period_runs(sto
     before = Retention(store, options, lambda: 0.0)
     for segments in range(1, 5):
         last = publish(before, manifest(segments, after=last))
-    assert last is not None
     assert there(store) == [0, 2, 3, 4, 5, 6, 7]
     retention = Retention(store, options, lambda: 0.0)
     retention.take_up(last)

@@ -132,7 +132,6 @@ def test_what_a_killed_run_wrote_too_early_stays_when_it_comes_again(tmp_path: P
     with pytest.raises(Killed):
         written(KilledStore(store, len(counter.operations) - 2, True), SENT[:2], options=options)
     sink, resumed = resume_segments(store, options=options, clocks=hands.clocks())
-    assert resumed is not None
     sink.open(resumed.header)
     for packet in SENT[2 : 2 + more]:
         hands.wait(1.0)
@@ -219,7 +218,6 @@ def test_a_stream_with_a_window_is_continued_with_all_its_sizes(tmp_path: Path) 
     hands = Hands()
     written(stopped, sent[:130], options=options, hands=hands)
     _, resumed = resume_segments(stopped)
-    assert resumed is not None
     records = [len(packet.payload) + 12 for packet in sent[:130]]
     assert [info.bytes for info in resumed.packets] == records
     assert [info.kind for info in resumed.packets] == [packet.kind for packet in sent[:130]]
@@ -276,7 +274,6 @@ def test_of_frames_that_have_left_the_window_size_kind_and_time_are_known(tmp_pa
     sent, store = packets(9), folder(tmp_path)
     written(store, sent, options=SegmentsOptions(window_seconds=0.01, grace_seconds=0.0))
     found = resume_segments(store)[1]
-    assert found is not None
     with StreamReader(as_file(sent)) as whole:
         gone = [info for info in found.packets if info.offset == LOST]
         assert [info.index for info in gone] == [3, 4, 5]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
+from structgstream.codec.segments.manifest import file_name
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
 
@@ -28,9 +28,7 @@ def test_files_are_written_replaced_listed_and_removed(tmp_path: Path) -> None:
     assert sorted(os.listdir(store.folder)) == ["notes.txt"]
     with pytest.raises(StreamError, match=r"Cannot read .*manifest\.json \(No such file"):
         store.get("manifest.json")
-    room = store.free_bytes()
-    assert room is not None
-    assert room > 0
+    assert store.free_bytes() > 0
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,7 +65,8 @@ def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
 
 def test_names_of_the_sink_are_those_of_the_document_and_known() -> None:
     sixteen, digest = "0123456789abcdef", "0123456789abcdef" + "0" * 48
-    ours = [init_name(0, digest), part_name(12, digest), segment_name(123456789, digest), history_name(0, digest)]
+    given = (("init", 0), ("part", 12), ("segment", 123456789), ("history", 0))
+    ours = [file_name(kind, number, digest) for kind, number in given]
     assert ours[:2] == [f"init-0000-{sixteen}.sgs", f"part-00000012-{sixteen}.sgs"]
     assert ours[2:] == [f"segment-123456789-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
     assert all(map(is_ours, [*ours, "manifest.json"]))
@@ -83,7 +82,6 @@ def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-c", child, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == b"locked\n"
         with pytest.raises(StorageError, match="Another process writes to .*; wait for its end"):
             store.lock()

@@ -17,7 +17,7 @@ from structgstream.errors import StreamError
 from tests.support.properties import examples
 from tests.support.segment_folders import GrowingFolder
 from tests.support.segment_streams import folder
-from tests.support.streams import small_stream
+from tests.support.streams import flipped, small_stream
 
 STREAM = small_stream(7)
 
@@ -81,7 +81,7 @@ def test_a_damaged_file_is_seen_by_its_length_or_with_check_by_its_hash(tmp_path
     manifest = GrowingFolder(tmp_path, STREAM).write_all()
     store, name = FolderStore(tmp_path), manifest.segments[0].file
     data = store.get(name)
-    store.put(name, data[:-1] + bytes([data[-1] ^ 1]))
+    store.put(name, flipped(data, 8 * len(data) - 8))
     assert len(StoredBytes(store, manifest)[:]) == len(STREAM)
     with pytest.raises(StreamError, match=f"{name} in .* is damaged"):
         StoredBytes(store, manifest, check=True)[:]

@@ -57,9 +57,15 @@ def pack_raw_block(name: FieldName, value: Tensor) -> bytes:
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 
 
-def pack_coded_block(name: FieldName, data: bytes) -> bytes:
-    """One field, coded."""
-    return BLOCK.pack(_CODES[name], CODED, 2, 1) + struct.pack("<I", len(data)) + data
+def pack_blocks(values: Mapping[FieldName, Tensor], coded: Mapping[FieldName, bytes]) -> dict[FieldName, bytes]:
+    """The blocks of fields, in the order of the state table: coded where ``coded`` has their bytes, otherwise raw."""
+    blocks: dict[FieldName, bytes] = {}
+    for name, code in _CODES.items():
+        if name in values and name in coded:
+            blocks[name] = BLOCK.pack(code, CODED, 2, 1) + struct.pack("<I", len(coded[name])) + coded[name]
+        elif name in values:
+            blocks[name] = pack_raw_block(name, values[name])
+    return blocks
 
 
 def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[Block]:
@@ -95,24 +101,17 @@ def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[B
 def unpack_blocks(
     payload: bytes, start: int, *, where: str
 ) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
-    """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end.
-
-    Raises:
-        StreamError: as :func:`iterate_blocks`.
-    """
+    """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end. Raises
+    StreamError as :func:`iterate_blocks`."""
     values: dict[FieldName, Tensor] = {}
     coded: dict[FieldName, memoryview] = {}
     for block in iterate_blocks(payload, start, where=where):
         if block.coding == RAW:
-            values[block.name] = _numbers(payload, block)
+            array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
+            values[block.name] = torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
         else:
             coded[block.name] = memoryview(payload)[block.data : block.end]
     return values, coded
-
-
-def _numbers(payload: bytes, block: Block) -> Tensor:
-    array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
-    return torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
 
 
 MAX_JSON_BYTES = 2**20

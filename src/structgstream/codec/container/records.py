@@ -110,11 +110,9 @@ def check_prefix(data: ByteSource, name: str) -> None:
         raise StreamError(f"{name} is cut at byte {len(data)}, before its first frame.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
-        newer, older = (
-            "Install a newer structgstream.",
-            "Reconstruct it again, or install the structgstream that wrote it.",
-        )
-        advice = newer if major > MAJOR else older
+        advice = "Reconstruct it again, or install the structgstream that wrote it."
+        if major > MAJOR:
+            advice = "Install a newer structgstream."
         raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
@@ -152,9 +150,8 @@ def footer_offset(data: ByteSource) -> int | None:
     if magic != FOOTER_MAGIC or not PREFIX.size <= offset < at:
         return None
     head = read_head(data, offset)
-    if head is None or head.type != RecordType.INDEX or offset + head.bytes != at:
-        return None
-    return offset
+    is_index = head is not None and head.type == RecordType.INDEX and offset + head.bytes == at
+    return offset if is_index else None
 
 
 def incomplete_reason(data: ByteSource, offset: int) -> str:
@@ -174,6 +171,12 @@ def scan_records(data: ByteSource, offset: int = PREFIX.size) -> Iterator[Record
 
 
 FRAME = struct.Struct("<Id")  # index, presentation time in seconds
+
+
+def read_frame(data: ByteSource, offset: int) -> tuple[int, float]:
+    """Index and presentation time in the packet whose record is at ``offset``, of at least as many bytes."""
+    start = offset + RECORD.size
+    return FRAME.unpack(data[start : start + FRAME.size])
 
 
 @dataclass(frozen=True)
@@ -216,57 +219,29 @@ def read_index(data: ByteSource, start: int, *, period: int = 0) -> "tuple[array
     if end is None or end < start:
         return None
     index = read_record(data, end)
-    if index is None or len(index.payload) % INDEX_ENTRY.size:
+    if index is None:
         return None
-    heads = _Heads(period)
+    offsets, periods, entries, seconds = array("Q"), list[Period](), bytearray(), 0.0
     while start < end:
-        if (head := read_head(data, start)) is None or not heads.add(data, head, start):
+        if (head := read_head(data, start)) is None or head.type == RecordType.INDEX:
             return None
-        start += head.bytes
-    if start != end or heads.pending is not None or heads.entries != index.payload:
-        return None
-    return heads.offsets, heads.periods
-
-
-class _Heads:
-    """The expected entries of the index, from the records' heads in order."""
-
-    def __init__(self, period: int) -> None:
-        self.entries = bytearray()
-        self.offsets: array[int] = array("Q")
-        self.periods: list[Period] = []
-        self.pending: Period | None = None  # its first packet has not come
-        self._number = period
-        self._seconds = 0.0
-
-    def add(self, data: ByteSource, head: Head, offset: int) -> bool:
-        """Take the record at ``offset``; False if it cannot be there."""
+        count = len(offsets)
+        begins = count == (periods[-1].first_frame if periods else 0)  # a period, with its first packet
         if head.type == RecordType.INIT:
-            return self._add_init(head, offset)
-        if head.type in (RecordType.KEY, RecordType.DELTA):
-            return self._add_packet(data, head, offset)
-        return head.type != RecordType.INDEX
-
-    def _add_init(self, head: Head, offset: int) -> bool:
-        count = len(self.offsets)
-        if self.pending is not None or not count or head.period != self._number + 1:
-            return False
-        self._number = head.period
-        self.pending = Period(head.period, count, offset, head.bytes)
-        self.entries += INDEX_ENTRY.pack(count, head.type, offset)
-        return True
-
-    def _add_packet(self, data: ByteSource, head: Head, offset: int) -> bool:
-        count, begins = len(self.offsets), self.pending is not None or not self.offsets
-        if head.length < FRAME.size or head.period != self._number or (begins and head.type != RecordType.KEY):
-            return False
-        frame, pts_seconds = FRAME.unpack(data[offset + RECORD.size : offset + RECORD.size + FRAME.size])
-        if frame != count or (count and not pts_seconds > self._seconds):
-            return False
-        if self.pending is not None:
-            self.periods.append(self.pending)
-            self.pending = None
-        self._seconds = pts_seconds
-        self.offsets.append(offset)
-        self.entries += INDEX_ENTRY.pack(frame, head.type, offset)
-        return True
+            if begins or head.period != period + 1:
+                return None
+            period = head.period
+            periods.append(Period(period, count, start, head.bytes))
+            entries += INDEX_ENTRY.pack(count, head.type, start)
+        elif head.type in PACKET_KINDS:
+            if head.length < FRAME.size or head.period != period or (begins and head.type != RecordType.KEY):
+                return None
+            frame, pts_seconds = read_frame(data, start)
+            if frame != count or (count and not pts_seconds > seconds):
+                return None
+            seconds = pts_seconds
+            offsets.append(start)
+            entries += INDEX_ENTRY.pack(count, head.type, start)
+        start += head.bytes
+    is_empty = bool(periods) and periods[-1].first_frame == len(offsets)  # the last period
+    return None if start != end or is_empty or entries != index.payload else (offsets, periods)

@@ -18,9 +18,8 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.rans import uses_native
-from structgstream.errors import OutOfMemoryError
-from structgstream.kernels.native import native_library
+from structgstream.codec.entropy.rans import code_native, uses_native
+from structgstream.kernels.native import members
 
 HALF = 1 << 15
 NEAR_SIZES = 6
@@ -33,7 +32,6 @@ BLOCK_CONTEXTS = (90, 198)
 ACTIVITY_CONTEXTS = (255, 108, 360)
 AHEAD = 3
 """Bytes that a decoder reads past the end of the data."""
-_NO_MEMORY, _DAMAGED = 1, 2  # results of the C++ coders
 _NUMBER_BYTES = 64  # upper bound of the bytes of a number or of two flags
 
 
@@ -45,27 +43,7 @@ def residual_contexts(columns: int) -> tuple[int, ...]:
 class NativeModel(ctypes.Structure):
     """``sgs_model``."""
 
-    _fields_ = (
-        ("chances", ctypes.c_void_p),
-        ("seen", ctypes.c_void_p),
-        ("weights", ctypes.c_void_p),
-        ("starts", ctypes.c_void_p),
-        ("inputs", ctypes.c_int32),
-        ("nodes", ctypes.c_int32),
-    )
-
-
-class NativeArithmetic(ctypes.Structure):
-    """``sgs_arithmetic``."""
-
-    _fields_ = (
-        ("bytes", ctypes.c_void_p),
-        ("size", ctypes.c_int64),
-        ("place", ctypes.c_int64),
-        ("low", ctypes.c_uint32),
-        ("range", ctypes.c_uint32),
-        ("started", ctypes.c_int32),
-    )
+    _fields_ = (*members(ctypes.c_void_p, "chances seen weights starts"), *members(ctypes.c_int32, "inputs nodes"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +70,11 @@ class Model:
         """An independent copy."""
         return Model(self.chances.copy(), self.seen.copy(), self.weights.copy(), self.starts)
 
-    @property
-    def nodes(self) -> int:
-        """Number of binary decisions (nodes) of a value."""
-        return self.chances.shape[1]
-
     @cached_property
     def native(self) -> NativeModel:
         """The same memory as a C structure."""
         arrays = (self.chances, self.seen, self.weights, self.starts)
-        return NativeModel(*(array.ctypes.data for array in arrays), len(self.starts), self.nodes)
+        return NativeModel(*(array.ctypes.data for array in arrays), len(self.starts), self.chances.shape[1])
 
 
 class Models:
@@ -123,14 +96,25 @@ class Models:
         return self._before | self._now
 
 
-class ArithmeticState:
-    """The arithmetic code of one field, of bytes to decode, or of none to encode."""
+class ArithmeticState(ctypes.Structure):
+    """The arithmetic code of one field, of bytes to decode, or of none to encode; also ``sgs_arithmetic``."""
+
+    _fields_ = (
+        *members(ctypes.c_void_p, "bytes"),
+        *members(ctypes.c_int64, "size place"),
+        *members(ctypes.c_uint32, "low range"),
+        *members(ctypes.c_int32, "started"),
+    )
+    size: int
+    place: int
+    low: int
+    range: int
+    started: int
 
     def __init__(self, data: bytes | memoryview | None) -> None:
         self.encodes = data is None
-        self.buffer = np.zeros(0, np.uint8) if data is None else np.frombuffer(bytes(data), np.uint8)
-        self.size = len(self.buffer)
-        self.place = self.low = self.range = self.started = 0
+        self.buffer = np.frombuffer(bytes(data or b""), np.uint8)
+        super().__init__(self.buffer.ctypes.data, len(self.buffer))
 
     def reserve(self, numbers: int) -> None:
         """Makes room for this many more numbers."""
@@ -138,15 +122,7 @@ class ArithmeticState:
         if self.encodes and need > self.size:
             grown = np.empty(need, np.uint8)
             grown[: self.place] = self.buffer[: self.place]
-            self.buffer, self.size = grown, need
-
-    def native(self) -> NativeArithmetic:
-        """The state as a C structure; :meth:`take` reads it back."""
-        return NativeArithmetic(self.buffer.ctypes.data, self.size, self.place, self.low, self.range, self.started)
-
-    def take(self, state: NativeArithmetic) -> None:
-        """Takes over the state after a C++ call."""
-        self.place, self.low, self.range, self.started = state.place, state.low, state.range, state.started
+            self.buffer, self.bytes, self.size = grown, grown.ctypes.data, need
 
     def is_exhausted(self) -> bool:
         """Whether a decoder has read exactly all bytes."""
@@ -221,7 +197,7 @@ class _Coder:
         self._chances, self._seen = model.chances.ravel().tolist(), model.seen.ravel().tolist()
         self._weights: list[list[int]] = model.weights.tolist()
         self._starts = model.starts.tolist()
-        self._nodes = model.nodes
+        self._nodes = model.chances.shape[1]
         self._data = arithmetic.buffer[: arithmetic.place if self._encodes else None].tobytes()
         self._out = bytearray(self._data)
         self._place, self._low, self._range = arithmetic.place, arithmetic.low, arithmetic.range
@@ -248,10 +224,6 @@ class _Coder:
         byte = self._data[self._place] if self._place < len(self._data) else 0
         self._low = (self._low << 8 | byte) & 0xFFFFFFFF
         self._place += 1
-
-    def even(self, yes: int) -> int:
-        """Codes a decision of probability one half."""
-        return self._decide(yes, HALF)
 
     def _decide(self, yes: int, chance: int) -> int:
         bound = (self._range >> 16) * chance
@@ -307,27 +279,15 @@ class _Coder:
                 length += 1
             found = 1
             for bit in range(length - 1, -1, -1):
-                found = found << 1 | self.even(rest >> bit & 1 if rest > 0 else 0)
+                found = found << 1 | self._decide(rest >> bit & 1 if rest > 0 else 0, HALF)
             size = found + NEAR_SIZES
         return -size if negative else size
 
 
 def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model], *given: int | np.ndarray) -> bool:
-    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds. Raises
-    OutOfMemoryError if there is not enough memory."""
-    state, arguments = arithmetic.native(), list[int]()
-    for value in given:
-        if isinstance(value, np.ndarray):
-            assert value.flags.c_contiguous
-            value = value.ctypes.data
-        arguments.append(value)
-    coder = getattr(native_library(), name)
-    result = coder(*map(ctypes.byref, (state, *(model.native for model in models))), arithmetic.encodes, *arguments)
-    arithmetic.take(state)
-    if result == _NO_MEMORY:
-        raise OutOfMemoryError("to code decisions")
-    assert result <= _DAMAGED, "decisions fit their models"
-    return not result
+    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds."""
+    state = map(ctypes.byref, (arithmetic, *(model.native for model in models)))
+    return code_native(name, *state, arithmetic.encodes, *given, doing="to code decisions")
 
 
 def size_class(size: int) -> int:

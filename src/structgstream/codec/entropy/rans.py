@@ -11,6 +11,7 @@ directions use the same order and contexts. This module codes the init record, `
 
 import ctypes
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ def decode_lanes(
 LANES = (1, 4, 32)
 """Number of lanes, by the code in a section's head."""
 
-_NO_MEMORY = 1
+_NO_MEMORY, _DAMAGED = 1, 2  # results of the C++ coders
 _LANE_BYTES = 3  # cost of a lane: half of its final state, and half of what is left of the other half
 _MAX_SHARE = 512  # lanes cost at most a 512th of a section
 
@@ -106,11 +107,6 @@ def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: 
     used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
     size_bytes = int(used @ code_costs()) >> COST_BITS + 3
     return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MAX_SHARE <= size_bytes)
-
-
-def has_native() -> bool:
-    """Whether the native library, and with it the C++ coder, is available."""
-    return native_reason() is None
 
 
 def encode(
@@ -170,33 +166,35 @@ def decode(
     return symbols, end
 
 
-def uses_native(native: bool | None) -> bool:
+def uses_native(native: bool | None = None) -> bool:
     """Whether to use C++; None uses it if available."""
-    return has_native() if native is None else native
+    return native_reason() is None if native is None else native
 
 
-def _address(array: np.ndarray) -> int:
-    assert array.flags.c_contiguous
-    return array.ctypes.data
+def code_native(name: str, *given: Any, doing: str) -> bool:
+    """Calls a C++ coder, with arrays as their addresses; returns whether what it coded is sound. Raises
+    OutOfMemoryError if there is not enough memory for ``doing``."""
+    arguments = []
+    for value in given:
+        if isinstance(value, np.ndarray):
+            assert value.flags.c_contiguous
+            value = value.ctypes.data
+        arguments.append(value)
+    result = getattr(native_library(), name)(*arguments)
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError(doing)
+    assert result in (0, _DAMAGED), "what is coded fits its tables or models"
+    return not result
 
 
 def _native_encode(
     symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, lanes: int
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
     states, words, word_count = np.empty(lanes, np.uint32), np.empty(len(symbols), np.uint16), ctypes.c_int64()
-    result = native_library().sgs_rans_encode(
-        _address(symbols),
-        _address(contexts),
-        len(symbols),
-        *_table_arguments(tables),
-        lanes,
-        _address(states),
-        _address(words),
-        ctypes.byref(word_count),
-    )
-    if result == _NO_MEMORY:
-        raise OutOfMemoryError("to encode symbols")
-    assert not result, "symbols, contexts and tables fit"
+    coded = (symbols, contexts, len(symbols), tables.rows, tables.contexts, tables.alphabet)
+    written = (lanes, states, words, ctypes.byref(word_count))
+    sound = code_native("sgs_rans_encode", *coded, *written, doing="to encode symbols")
+    assert sound, "symbols, contexts and tables fit"
     return states, words[: word_count.value]
 
 
@@ -204,23 +202,10 @@ def _native_decode(
     words: NDArray[np.uint16], states: NDArray[np.uint32], contexts: NDArray[np.uint16], tables: FrequencyTables
 ) -> NDArray[np.uint8] | None:
     symbols = np.empty(len(contexts), np.uint8)
-    result = native_library().sgs_rans_decode(
-        _address(words),
-        len(words),
-        _address(states),
-        len(states),
-        _address(contexts),
-        len(contexts),
-        *_table_arguments(tables),
-        _address(symbols),
-    )
-    if result == _NO_MEMORY:
-        raise OutOfMemoryError("to decode symbols")
-    return None if result else symbols
-
-
-def _table_arguments(tables: FrequencyTables) -> tuple[int, int, int]:
-    return _address(tables.rows), tables.contexts, tables.alphabet
+    read = (words, len(words), states, len(states), contexts, len(contexts))
+    known = (tables.rows, tables.contexts, tables.alphabet)
+    sound = code_native("sgs_rans_decode", *read, *known, symbols, doing="to decode symbols")
+    return symbols if sound else None
 
 
 LARGEST_SYMBOL = 7

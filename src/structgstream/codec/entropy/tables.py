@@ -7,8 +7,6 @@ Frequencies are coded as levels, floating-point numbers with ``p`` bits of manti
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,44 +208,29 @@ _PER_LN2 = 94548  # 2^16 / ln 2
 _EXPLICIT_BITS = 2 + 1 + PRECISION_BITS + 1 + 1
 
 
-class _Form(NamedTuple):
-    """How a row is coded explicitly, in the order in which equally cheap ones are preferred.
-
-    Args:
-        geometric: whether levels are relative to the geometric row, not to the previous one.
-        precision, order: of levels and of their codes.
-        bitmap: whether presence is coded as one flag per symbol, not as a number of symbols.
-    """
-
-    geometric: bool
-    precision: int
-    order: int
-    bitmap: bool
-
-
-_FORMS = [_Form(*form) for form in product((False, True), range(1 << PRECISION_BITS), (0, 1), (False, True))]
-
-
 @dataclass(frozen=True)
 class _Explicit:
-    """Explicitly coded rows of one precision; axes are flags of presence, order, reference, context and symbol."""
+    """Explicitly coded rows of one precision.
+
+    The first axes are flags: whether levels are relative to the geometric row, not to the previous one; the order of
+    their codes; whether presence is coded as one flag per symbol (a bitmap), not as a number of symbols.
+    """
 
     rows: NDArray[np.int64]  # [2, 2, 2, C, A] frequencies
     cost: NDArray[np.int64]  # [2, 2, 2, C] of row and symbols, 2^-16 bit
-    steps: NDArray[np.int64]  # [2, 2, C, A], levels relative to those of the reference
-    present: NDArray[np.bool_]  # [2, C, A]
+    steps: NDArray[np.int64]  # [2, 2, C, A], levels relative to those of the reference, by reference and order
+    present: NDArray[np.bool_]  # [2, C, A], by coding of presence
 
-    def bits(self, form: _Form, context: int, number: int) -> str:
-        """The row of one context as bits; ``number`` of its geometric row."""
-        flags = self.present[int(form.bitmap), context]
+    def bits(self, form: tuple[int, int, int], context: int, *, precision: int, number: int) -> str:
+        """The row of one context as bits; ``form`` are the flags, ``number`` is that of its geometric row."""
+        geometric, order, bitmap = form
+        flags = self.present[bitmap, context]
         present = np.flatnonzero(flags)
-        text = "111" + fixed(number, NUMBER_BITS) if form.geometric else "110"
-        text += fixed(form.precision, PRECISION_BITS) + fixed(form.order, 1) + fixed(form.bitmap, 1)
-        text += (
-            "".join(fixed(bool(there), 1) for there in flags) if form.bitmap else fixed(len(present) - 1, COUNT_BITS)
-        )
-        steps = self.steps[form.order, int(form.geometric), context, present].tolist() if len(present) > 1 else []
-        return text + "".join(signed_golomb(step, order=form.order) for step in steps)
+        text = "111" + fixed(number, NUMBER_BITS) if geometric else "110"
+        text += fixed(precision, PRECISION_BITS) + fixed(order, 1) + fixed(bitmap, 1)
+        text += "".join(fixed(bool(there), 1) for there in flags) if bitmap else fixed(len(present) - 1, COUNT_BITS)
+        steps = self.steps[geometric, order, context, present].tolist() if len(present) > 1 else []
+        return text + "".join(signed_golomb(step, order=order) for step in steps)
 
 
 def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
@@ -273,18 +256,16 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
     if len(tried):
         references = np.stack([kept[tried], family[number[tried]]])
         found = [_explicit(counts[tried], references, precision) for precision in range(1 << PRECISION_BITS)]
-        costs = np.stack([found[form.precision].cost[_place(form)] for form in _FORMS])
-        for place, best in enumerate(costs.argmin(0).tolist()):
-            context, form = tried[place], _FORMS[best]
-            if costs[best, place] < cost[context]:
-                rows[context] = found[form.precision].rows[*_place(form), place]
-                pieces[context] = found[form.precision].bits(form, place, int(number[context]))
+        costs = np.stack([one.cost for one in found], axis=1)  # Of equally cheap forms the first is taken.
+        best = costs.reshape(-1, len(tried)).argmin(0)
+        for place, flags in enumerate(zip(*np.unravel_index(best, costs.shape[:4]))):
+            context, (geometric, precision, order, bitmap) = tried[place], map(int, flags)
+            if costs[*flags, place] < cost[context]:
+                form = geometric, order, bitmap
+                rows[context] = found[precision].rows[*form, place]
+                pieces[context] = found[precision].bits(form, place, precision=precision, number=int(number[context]))
     changes = any(piece != "0" for piece in pieces)
     return FrequencyTables(rows.astype(np.uint16)), pack_bits(pieces) if changes else b""
-
-
-def _place(form: _Form) -> tuple[int, int, int]:
-    return int(form.bitmap), form.order, int(form.geometric)
 
 
 def _explicit(counts: NDArray[np.int64], reference_rows: NDArray[np.int64], precision: int) -> _Explicit:
@@ -303,18 +284,17 @@ def _explicit(counts: NDArray[np.int64], reference_rows: NDArray[np.int64], prec
     every = weights_of(np.arange(1, top_level(precision) + 1), precision=precision)
     shares = counts.sum(1)[:, None, None] * every * _PER_LN2 >> 12 + precision
     level_costs = shares - counts[..., None] * logs()[every >> precision]
-    step_bits = np.stack([_step_bits(precision, order) for order in (0, 1)])[:, references - 1]
+    step_bits = np.stack([_step_bits(precision, order) for order in (0, 1)])[:, references - 1].swapaxes(0, 1)
     levels = 1 + (level_costs + (step_bits << COST_BITS)).argmin(-1)
     bits = np.take_along_axis(step_bits, levels[..., None] - 1, -1)[..., 0]
     occurs = counts > 0
     last = alphabet - 1 - occurs[:, ::-1].argmax(1)
     present = np.stack([np.arange(alphabet) <= last[:, None], occurs])
-    shown = present[:, None, None]
-    rows = weighed(np.where(shown, weights_of(levels, precision=precision), 0))
+    rows = weighed(np.where(present, weights_of(levels, precision=precision)[:, :, None], 0))
     of_presence, of_reference = np.array([COUNT_BITS, alphabet]), np.array([0, NUMBER_BITS])
-    heads = _EXPLICIT_BITS + of_presence[:, None, None, None] + of_reference[:, None]
-    size = heads + np.where(shown.sum(-1) > 1, (bits * shown).sum(-1), 0)
-    return _Explicit(rows, _data_cost(counts, rows) + (size << COST_BITS), levels - references, present)
+    heads = _EXPLICIT_BITS + of_presence[:, None] + of_reference[:, None, None, None]
+    size = heads + np.where(present.sum(-1) > 1, (bits[:, :, None] * present).sum(-1), 0)
+    return _Explicit(rows, _data_cost(counts, rows) + (size << COST_BITS), levels - references[:, None], present)
 
 
 def _data_cost(counts: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -6,8 +6,9 @@ each row except those of the first pass has coded neighbours on both sides as co
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from structgstream.codec.fields.quantization import check_range, dequantize, qua
 from structgstream.errors import StreamError
 from structgstream.scene.state import FIELDS, FREE_COLUMNS, FieldName, Granularity, fields_of
 
+Name = TypeVar("Name", bound=str)
 _MOST = 255  # a residual's magnitude is clamped to this in a size
 
 
@@ -95,9 +97,14 @@ def code_change(
     return Change(residuals, history, sizes)
 
 
+def _side_by_side(widths: Sequence[tuple[Name, int]]) -> list[tuple[Name, int, int]]:
+    """Name, first column and end of groups of columns in this order."""
+    ends = accumulate(width for _, width in widths)
+    return [(name, end - width, end) for (name, width), end in zip(widths, ends)]
+
+
 FREE_PARAMETERS = FIELDS["free"].parameters
-_ENDS = tuple(accumulate(parameter.columns for parameter in FREE_PARAMETERS))
-GROUPS = tuple((p.path, end - p.columns, end) for p, end in zip(FREE_PARAMETERS, _ENDS, strict=True))
+GROUPS = _side_by_side([(parameter.path, parameter.columns) for parameter in FREE_PARAMETERS])
 MAX_FREE = 2**18
 """Largest number of free Gaussians of a scene: symbols can cost less than a bit, so bytes do not bound it."""
 _MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
@@ -114,23 +121,24 @@ class FreeBins:
     change: Change  # by the last frame; zero for Gaussians spawned in it
 
     @classmethod
+    def unchanged(cls, births: NDArray[np.int64], bins: Bins) -> "FreeBins":
+        """Bins with zero change, as of spawned Gaussians, or after a key packet."""
+        return cls(births, bins, Change.none(*bins.shape))
+
+    @classmethod
     def none(cls) -> "FreeBins":
         """No free Gaussians."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
+        return cls.unchanged(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32))
 
     def without_change(self) -> "FreeBins":
-        """The same bins with zero change, as after a key packet."""
-        return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
+        """The same bins with zero change."""
+        return FreeBins.unchanged(self.births, self.bins)
 
     @classmethod
     def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
         """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change. Raises StreamError if
         a bin is beyond 22 bits."""
-        return cls(
-            births.cpu().numpy().astype(np.int64),
-            quantize(values, _steps_of_columns(steps)),
-            Change.none(len(births), FREE_COLUMNS),
-        )
+        return cls.unchanged(births.cpu().numpy().astype(np.int64), quantize(values, _steps_of_columns(steps)))
 
     def dequantized(self, steps: Mapping[str, float]) -> Tensor:
         """The values ``[F, 14]``."""
@@ -147,28 +155,21 @@ def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *,
     Raises StreamError if identities do not ascend or are out of range, or there are too many."""
     alive = None if after is None else np.isin(before.births, after.births)
     alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
-    old = FreeBins(
-        before.births[alive],
-        before.bins[alive],
-        before.change.select(alive),
-    )
-    change = None
+    old = FreeBins(before.births[alive], before.bins[alive], before.change.select(alive))
+    change: Change | None = None
     new: FreeBins | None = None
     if after is not None:
         kept = np.isin(after.births, before.births)
         change = Change.of(after.bins[kept] - old.bins)
-        new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
+        new = FreeBins.unchanged(after.births[~kept], after.bins[~kept])
     change = code_change(coder, change, old.change, groups=GROUPS)
     kept_bins = old.bins + change.residuals
     spawned = _code_spawned(coder, new, kept_bins, where=where)
     births = np.concatenate([old.births, spawned.births])
     if not (np.diff(births) > 0).all():
         raise StreamError(f"{where} has births that do not ascend; it is damaged.")
-    return FreeBins(
-        births,
-        np.concatenate([kept_bins, spawned.bins]),
-        change.extended(len(spawned.births)),
-    )
+    bins = np.concatenate([kept_bins, spawned.bins])
+    return FreeBins(births, bins, change.extended(len(spawned.births)))
 
 
 def _code_spawned(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
@@ -184,20 +185,17 @@ def _code_spawned(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, wh
     if new is not None:
         if int(new.births.min()) < 0:
             raise StreamError(f"{where} has births below 0.")
-        frames = np.diff(new.births >> _FRAME_BITS, prepend=0)
-        numbers = np.diff(new.births & (1 << _FRAME_BITS) - 1, prepend=0)
-        numbers = np.where(frames != 0, new.births & (1 << _FRAME_BITS) - 1, numbers)
+        frames, number = np.diff(new.births >> _FRAME_BITS, prepend=0), new.births & (1 << _FRAME_BITS) - 1
+        numbers = np.where(frames != 0, number, np.diff(number, prepend=0))
     frames = coder.numbers("free_births.frame", frames, [nothing], counts=[1])
     fresh = frames != 0
     numbers = coder.numbers("free_births.number", numbers, [fresh], counts=[2])
     frame, number = np.cumsum(frames), _restarted_sums(numbers, fresh)
-    if not (0 <= int(frame.min()) <= int(frame.max()) < 1 << 31 and int(number.min()) >= 0):
-        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
-    if int(number.max()) >= 1 << _FRAME_BITS:
-        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
-    births = (frame << _FRAME_BITS) + number
+    for found, bits in ((frame, 31), (number, _FRAME_BITS)):
+        if not 0 <= int(found.min()) <= int(found.max()) < 1 << bits:
+            raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
     bins = _code_spawned_bins(coder, None if new is None else new.bins, alive, count=count, where=where)
-    return FreeBins(births, bins, Change.none(count, FREE_COLUMNS))
+    return FreeBins.unchanged((frame << _FRAME_BITS) + number, bins)
 
 
 def _code_spawned_bins(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
@@ -270,14 +268,21 @@ class SceneBins:
     weight_changes: Mapping[FieldName, Change]  # of weights, by field
     free: FreeBins  # the free Gaussians
 
+    @classmethod
+    def unchanged(
+        cls,
+        anchors: Bins,
+        columns: Sequence[tuple[FieldName, int, int]],
+        weights: Mapping[FieldName, Bins],
+        free: FreeBins,
+    ) -> "SceneBins":
+        """Bins with zero change."""
+        changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
+        return cls(anchors, columns, Change.none(*anchors.shape), weights, changes, free.without_change())
+
     def without_change(self) -> "SceneBins":
         """The same bins with zero change."""
-        return replace(
-            self,
-            change=Change.none(*self.anchors.shape),
-            weight_changes={name: Change.none(*bins.shape) for name, bins in self.weights.items()},
-            free=self.free.without_change(),
-        )
+        return SceneBins.unchanged(self.anchors, self.columns, self.weights, self.free)
 
 
 def quantize_state(
@@ -286,20 +291,15 @@ def quantize_state(
     """Quantizes the dynamic fields of a state. Raises StreamError if a bin is beyond 22 bits."""
     names: list[FieldName] = [name for name in quantized_fields("anchor") if name in dynamic]
     rows = [quantize(state[name], steps[name]) for name in names]
-    count = len(state["anchor_positions"])
-    anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
-    ends = accumulate(found.shape[1] for found in rows)
-    columns: list[tuple[FieldName, int, int]] = [
-        (name, end - found.shape[1], end) for name, found, end in zip(names, rows, ends, strict=True)
-    ]
+    nothing = np.zeros((len(state["anchor_positions"]), 0), np.int32)
+    columns = _side_by_side([(name, found.shape[1]) for name, found in zip(names, rows)])
     weights: dict[FieldName, Bins] = {
         name: quantize(state[name], steps[name])[:, None] for name in quantized_fields("shared") if name in dynamic
     }
     free = FreeBins.none()
     if "free" in dynamic:
         free = FreeBins.quantized(state["free"], state["free_births"], steps)
-    changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
-    return SceneBins(anchors, columns, Change.none(*anchors.shape), weights, changes, free)
+    return SceneBins.unchanged(np.concatenate([nothing, *rows], axis=1), columns, weights, free)
 
 
 def dequantize_state(

@@ -38,16 +38,21 @@ _HALF = 30  # bits of the lower half of a Z-order key
 _WHERE = "The init record"
 
 
-class _Budget:
-    """Counts down the numbers that are still allowed."""
+class _Counts:
+    """Codes how many rows, columns or numbers there are, and counts down the numbers that are still allowed."""
 
-    def __init__(self, left: int) -> None:
-        self._left = left
+    def __init__(self, coder: SectionCoder, left: int) -> None:
+        self._coder, self._left = coder, left
 
-    def take(self, count: int) -> None:
-        self._left -= count
+    def code(self, name: str, count: int | None, *, most: int, what: str, numbers: int = 1) -> int:
+        """Codes a count, of things of so many ``numbers`` each."""
+        count = self._coder.number(name, count)
+        if count > most:
+            raise StreamError(f"{_WHERE} has {count} {what}; at most {most} are allowed.")
+        self._left -= count * numbers
         if self._left < 0:
             raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers per byte; it is damaged.")
+        return count
 
 
 def _max_numbers(coded: Iterable[bytes | memoryview]) -> int:
@@ -67,7 +72,7 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
         bins[name] = found
     encoder = SectionEncoder()
     numbers = sum(found.size for found in bins.values())
-    _code_fields(encoder, bins, bins.keys(), _Budget(numbers))
+    _code_fields(encoder, bins, bins.keys(), allowed=numbers)
     if numbers > (most := _max_numbers(encoder.fields.values())):
         raise StreamError(
             f"The header has {numbers} numbers, more than the {most} that its bytes allow; take smaller steps."
@@ -86,7 +91,7 @@ def decode_fields(
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
     decoder = SectionDecoder(coded, where=_WHERE)
-    bins = _code_fields(decoder, None, coded.keys(), _Budget(_max_numbers(coded.values())))
+    bins = _code_fields(decoder, None, coded.keys(), allowed=_max_numbers(coded.values()))
     decoder.end()
     return {name: dequantize(found, steps[name]) for name, found in bins.items()}
 
@@ -107,20 +112,20 @@ def max_columns(name: FieldName) -> int:
 
 
 def _code_fields(
-    coder: SectionCoder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
+    coder: SectionCoder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], *, allowed: int
 ) -> dict[FieldName, Bins]:
-    """Codes the fields ``names``: anchor fields, then the others."""
-    given: Mapping[FieldName, Bins] = bins or {}
-    found: dict[FieldName, Bins] = {}
-    positions = _code_positions(coder, given.get("anchor_positions"), budget)
-    found["anchor_positions"] = positions
+    """Codes the fields ``names``, of at most ``allowed`` numbers: anchor fields, then the others."""
+    given, counts = bins or {}, _Counts(coder, allowed)
+    positions = _code_positions(coder, given.get("anchor_positions"), counts)
+    found: dict[FieldName, Bins] = {"anchor_positions": positions}
     shifts = np.zeros(len(positions), np.int32)
     for name in _of_coding("rows", names):
-        shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
-        rows = None if shape is None else given[name].reshape(shape)
-        found[name], shifts = _code_rows(coder, name, rows, shifts, budget=budget)
+        rows = None
+        if name in given:
+            rows = given[name].reshape(len(positions), math.prod(given[name].shape[1:]))
+        found[name], shifts = _code_rows(coder, name, rows, shifts, counts=counts)
     for name in _of_coding("numbers", names):
-        found[name] = _code_numbers(coder, name, given[name].ravel() if name in given else None, budget)
+        found[name] = _code_numbers(coder, name, given[name].ravel() if name in given else None, counts)
     return _shaped(found)
 
 
@@ -146,20 +151,17 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
     return found
 
 
-def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> Bins:
+def _code_positions(coder: SectionCoder, bins: Bins | None, counts: _Counts) -> Bins:
     """Codes cells by the differences of successive Z-order keys.
 
     Rows need not be in Z-order; if they are not, signs are coded too.
     """
     given = None if bins is None else len(bins)
-    count = _bounded(coder.number("anchor_positions.rows", given), MAX_ANCHORS, "anchors")
-    budget.take(3 * count)
+    count = counts.code("anchor_positions.rows", given, most=MAX_ANCHORS, what="anchors", numbers=3)
     if not count:
         return np.zeros((0, 3), np.int32)
-    lowest = None if bins is None else bins.min(0)
-    origin = np.array(
-        [_code_signed(coder, "anchor_positions.origin", None if lowest is None else lowest[axis]) for axis in range(3)]
-    )
+    lowest = [None] * 3 if bins is None else bins.min(0).tolist()
+    origin = np.array([_code_signed(coder, "anchor_positions.origin", value) for value in lowest])
     steps: Naturals | None = None
     if bins is not None:
         cells = bins.astype(np.int64) - origin
@@ -193,12 +195,12 @@ def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> 
 
 
 def _code_rows(
-    coder: SectionCoder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, budget: _Budget
+    coder: SectionCoder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, counts: _Counts
 ) -> tuple[Bins, NDArray[np.int32]]:
     """Codes rows ``[n, C]``, column by column, and their shifts, in the context of another field's shifts ``like``."""
     given = None if bins is None else bins.shape[1]
-    columns = _bounded(coder.number(f"{name}.columns", given), max_columns(name), f"columns of {name}")
-    budget.take(columns * len(like))
+    most, what = max_columns(name), f"columns of {name}"
+    columns = counts.code(f"{name}.columns", given, most=most, what=what, numbers=len(like))
     shifts = None if bins is None else _common_shifts(bins, like)
     shifts = coder.residuals(f"{name}.shift", shifts, like.astype(np.uint16), count=SHIFTS)
     if (shifts < 0).any():
@@ -236,12 +238,10 @@ def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.where(together == 0, like, shifts).astype(np.int32)
 
 
-def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
+def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, counts: _Counts) -> Bins:
     """Codes numbers ``[n]`` of any size."""
-    count = _bounded(
-        coder.number(f"{name}.count", None if bins is None else len(bins)), MAX_WEIGHTS, f"numbers of {name}"
-    )
-    budget.take(count)
+    given = None if bins is None else len(bins)
+    count = counts.code(f"{name}.count", given, most=MAX_WEIGHTS, what=f"numbers of {name}")
     values = None if bins is None else zigzag(bins.astype(np.int64))
     values = coder.naturals(f"{name}.value", values, np.zeros(count, np.uint16), count=1)
     return _checked(unzigzag(values))
@@ -250,12 +250,6 @@ def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, budge
 def _code_signed(coder: SectionCoder, name: str, value: int | None) -> int:
     found = coder.number(name, None if value is None else zigzag(int(value)))
     return int(_checked(np.array([unzigzag(found)]))[0])
-
-
-def _bounded(number: int, most: int, what: str) -> int:
-    if number > most:
-        raise StreamError(f"{_WHERE} has {number} {what}; at most {most} are allowed.")
-    return number
 
 
 def _checked(bins: Naturals) -> Bins:

@@ -11,19 +11,22 @@ are whole numbers, what is not RFC 8259 is refused also where nobody asks for it
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache, partial
 from itertools import pairwise
-from typing import Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_type_hints
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.errors import StreamError
 
+Value = TypeVar("Value")
 MOST = 1e15
 """The largest number where nothing else is stated; whole numbers up to it are exact in a double."""
 
 _FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
+_HALF_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 class Fields:
@@ -39,30 +42,26 @@ class Fields:
             raise StreamError(f"{where} is {_shown(value)}; expected an object.")
         self._value: dict[str, Any] = value
 
-    def is_none(self, name: str) -> bool:
-        """Whether the field is there and null."""
-        return self._get(name) is None
-
     def whole(self, name: str, *, least: int = 0, most: int = 2**32 - 1) -> int:
         """A whole number."""
         return self._whole(name, self._get(name), least, most)
 
     def wholes(self, name: str, *, count: int, least: int = 0, most: int = 2**32 - 1) -> tuple[int, ...]:
         """A list of ``count`` whole numbers."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) != count:
-            self._refuse(name, values, f"a list of {count} whole numbers")
+        values = self._checked(name, lambda value: _is_list(value, count), f"a list of {count} whole numbers")
         return tuple(self._whole(name, value, least, most) for value in values)
 
     def number(self, name: str, *, least: float = -MOST) -> float:
         """A finite number."""
         return self._number(name, self._get(name), least)
 
+    def optional(self, name: str, *, least: float = -MOST) -> float | None:
+        """A finite number, or None for null."""
+        return None if self._get(name) is None else self.number(name, least=least)
+
     def pair(self, name: str) -> tuple[float, float]:
         """Two finite numbers that do not fall."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) != 2:
-            self._refuse(name, values, "two numbers")
+        values = self._checked(name, lambda value: _is_list(value, 2), "two numbers")
         first, last = (self._number(name, value, -MOST) for value in values)
         if first > last:
             self._refuse(name, values, "two numbers that do not fall")
@@ -70,37 +69,28 @@ class Fields:
 
     def text(self, name: str, *, most: int = 1000) -> str:
         """A text of at most ``most`` characters, which can be printed: JSON may hold halves of characters."""
-        value = self._get(name)
-        if not isinstance(value, str) or len(value) > most or any("\ud800" <= one <= "\udfff" for one in value):
-            self._refuse(name, value, f"a text of at most {most} characters")
-        return value
+
+        def fits(value: object) -> bool:
+            return isinstance(value, str) and len(value) <= most and not _HALF_CHARACTER.search(value)
+
+        return self._checked(name, fits, f"a text of at most {most} characters")
 
     def flag(self, name: str) -> bool:
         """True or false."""
-        value = self._get(name)
-        if not isinstance(value, bool):
-            self._refuse(name, value, "true or false")
-        return value
+        return self._checked(name, lambda value: isinstance(value, bool), "true or false")
 
     def file(self, name: str = "file") -> str:
         """The plain name of a file in the manifest's folder: no folder, no scheme, no leading dot."""
-        value = self._get(name)
-        if not isinstance(value, str) or not _FILE.fullmatch(value):
-            self._refuse(name, value, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")
-        return value
+        return self._matched(name, _FILE, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")
 
     def sha256(self, name: str = "sha256") -> str:
         """64 hex digits."""
-        value = self._get(name)
-        if not isinstance(value, str) or not _SHA256.fullmatch(value):
-            self._refuse(name, value, "64 hex digits")
-        return value
+        return self._matched(name, _SHA256, "64 hex digits")
 
     def items(self, name: str, *, most: int) -> "list[Fields]":
         """A list of at most ``most`` objects."""
-        values = self._get(name)
-        if not isinstance(values, list) or len(values) > most:
-            self._refuse(name, values, f"a list of at most {most} objects")
+        expected = f"a list of at most {most} objects"
+        values = self._checked(name, lambda value: isinstance(value, list) and len(value) <= most, expected)
         return [Fields(value, f"{self._where}, {name}[{i}]") for i, value in enumerate(values)]
 
     def fields(self, name: str) -> "Fields":
@@ -116,19 +106,34 @@ class Fields:
             raise StreamError(f"{self._where} has no {name!r}.")
         return self._value[name]
 
+    def _checked(self, name: str, fits: Callable[[Any], bool], expected: str) -> Any:
+        if not fits(value := self._get(name)):
+            self._refuse(name, value, expected)
+        return value
+
+    def _matched(self, name: str, pattern: re.Pattern[str], expected: str) -> str:
+        return self._checked(name, lambda value: isinstance(value, str) and bool(pattern.fullmatch(value)), expected)
+
     def _whole(self, name: str, value: Any, least: int, most: int) -> int:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not least <= value <= most or value != int(value):
+        if not _is_number(value) or not least <= value <= most or value != int(value):
             self._refuse(name, value, f"a whole number from {least} to {most}")
         return int(value)
 
     def _number(self, name: str, value: Any, least: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= MOST:
+        if not _is_number(value) or not least <= value <= MOST:
             self._refuse(name, value, f"a number from {least:g} to {MOST:g}")
         return float(value)
 
     def _refuse(self, name: str, value: object, expected: str) -> NoReturn:
         raise StreamError(f"{self._where} has {name!r} {_shown(value)}; expected {expected}.")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_list(value: object, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count
 
 
 def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
@@ -140,6 +145,17 @@ def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
     except (ValueError, RecursionError) as error:
         raise StreamError(f"{where} is not JSON ({error}).") from None
     return Fields(value, where)
+
+
+def parse_document(data: bytes, name: str, *, max_bytes: int, what: str, format: str, version: int) -> Fields:
+    """The JSON object in ``data``, ``what`` of a format and version. Raises StreamError if it is of another format or
+    version, or as :func:`parse_object`."""
+    top = parse_object(data, name, max_bytes=max_bytes)
+    if (found := top.text("format")) != format:
+        raise StreamError(f"{name} is no {what}: its format is {found!r}; expected {format!r}.")
+    if (found := top.whole("version")) != version:
+        raise StreamError(f"{name} has version {found}; this program reads {version}. Install a newer structgstream.")
+    return top
 
 
 def _number(text: str) -> int | float:
@@ -172,51 +188,109 @@ LISTED_SEGMENTS = 8
 """The newest segments are always listed in the manifest itself."""
 
 
+MAX_MANIFEST_BYTES = 4 * 2**20
+MAX_PAGE_BYTES = 4 * 2**20
+MAX_ENTRIES = 4096
+MAX_GROUP_FRAMES = 65_536
+MAX_SEGMENT_BYTES = 2**40
+MAX_FRAME_BYTES = 2**33
+MAX_LEVEL = 8
+MIN_FPS = 1e-9
+
+# A field of the values below is annotated with its reader, which also checks its bounds.
+Whole = Annotated[int, Fields.whole]
+Count = Annotated[int, partial(Fields.whole, least=1)]
+FrameCount = Annotated[int, partial(Fields.whole, least=1, most=MAX_GROUP_FRAMES)]
+FrameBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_FRAME_BYTES)]
+SegmentBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_SEGMENT_BYTES)]
+PageBytes = Annotated[int, partial(Fields.whole, least=1, most=MAX_PAGE_BYTES)]
+Number = Annotated[float, Fields.number]
+Pair = Annotated[tuple[float, float], Fields.pair]
+NumberOrNone = Annotated[float | None, Fields.optional]
+FileName = Annotated[str, Fields.file]
+Sha256 = Annotated[str, Fields.sha256]
+
+
+@cache
+def _readers(kind: type) -> dict[str, Callable[[Fields, str], Any]]:
+    return {name: hint.__metadata__[0] for name, hint in get_type_hints(kind, include_extras=True).items()}
+
+
+def _read(kind: type[Value], fields: Fields) -> Value:
+    """The value with the fields of an object."""
+    return kind(**{name: reader(fields, name) for name, reader in _readers(kind).items()})
+
+
+def _object(fields: Fields, name: str, *, kind: type[Value]) -> Value:
+    return _read(kind, fields.fields(name))
+
+
+def _list(fields: Fields, name: str, *, kind: type[Value], most: int = MAX_ENTRIES) -> tuple[Value, ...]:
+    return tuple(_read(kind, one) for one in fields.items(name, most=most))
+
+
+def _frame_bytes(fields: Fields, name: str) -> tuple[int, ...]:
+    count = fields.whole("frames", least=1, most=MAX_GROUP_FRAMES)
+    found = fields.wholes(name, count=count, least=1, most=MAX_FRAME_BYTES)
+    if sum(found) != fields.whole("bytes", most=MAX_SEGMENT_BYTES) or found[0] != fields.whole(
+        "key_bytes", most=MAX_FRAME_BYTES
+    ):
+        fields.refuse("states lengths of frames that are not those of the segment")
+    return found
+
+
+def _kind(fields: Fields, name: str) -> PacketKind:
+    kinds = {kind.name.lower(): kind for kind in PacketKind}
+    if (kind := fields.text(name, most=20)) not in kinds:
+        fields.refuse(f"has {name!r} {kind!r}; expected {' or '.join(kinds)}")
+    return kinds[kind]
+
+
 @dataclass(frozen=True)
 class Edge:
     """The newest frame."""
 
-    frame: int  # its number
-    pts_seconds: float  # its presentation time
-    captured_unix_seconds: float | None  # when it was filmed; None if that is not known
-    published_unix_seconds: float  # when it was written, by the writer's clock
+    frame: Whole  # its number
+    pts_seconds: Number  # its presentation time
+    captured_unix_seconds: NumberOrNone  # when it was filmed; None if that is not known
+    published_unix_seconds: Number  # when it was written, by the writer's clock
 
 
 @dataclass(frozen=True)
 class Window:
     """What is still there: everything from ``first_frame`` on. ``seconds`` is None if nothing is ever removed."""
 
-    first_frame: int
-    first_segment: int
-    seconds: float | None
+    first_frame: Whole
+    first_segment: Whole
+    seconds: NumberOrNone
 
 
 @dataclass(frozen=True)
 class PeriodEntry:
     """The init record of a period, and where the period begins."""
 
-    period: int
-    file: str
-    bytes: int
-    sha256: str
-    first_frame: int
-    first_segment: int
+    period: Whole
+    file: FileName
+    bytes: SegmentBytes
+    sha256: Sha256
+    first_frame: Whole
+    first_segment: Whole
 
 
 @dataclass(frozen=True)
 class SegmentEntry:
     """A whole group of frames."""
 
-    segment: int  # its number
-    file: str  # its name
-    period: int  # number of the period whose init record it needs
-    first_frame: int  # number of its key frame
-    frames: int  # how many
-    pts_seconds: tuple[float, float]  # presentation times of its first and last frame
-    bytes: int  # its length
-    key_bytes: int  # length of its prefix with which its first frame can be shown
-    frame_bytes: tuple[int, ...]  # length of each frame's records, in order
-    sha256: str  # of its content
+    segment: Whole  # its number
+    file: FileName  # its name
+    period: Whole  # number of the period whose init record it needs
+    first_frame: Whole  # number of its key frame
+    frames: FrameCount  # how many
+    pts_seconds: Pair  # presentation times of its first and last frame
+    bytes: SegmentBytes  # its length
+    key_bytes: FrameBytes  # length of its prefix with which its first frame can be shown
+    frame_bytes: Annotated[tuple[int, ...], _frame_bytes]  # length of each frame's records, in order
+    sha256: Sha256  # of its content
     segments = 1  # as of a page
 
     @property
@@ -229,28 +303,29 @@ class SegmentEntry:
 class HistoryEntry:
     """A page of older segments."""
 
-    file: str  # its name
-    level: int  # 0 if the page lists segments, otherwise it lists pages of the level below
-    first_segment: int  # number of the first segment of the page
-    segments: int  # number of segments in all
-    first_frame: int  # number of the first frame
-    frames: int  # number of frames in all
-    pts_seconds: tuple[float, float]  # presentation times of the first and the last frame
-    bytes: int  # length of the page
-    sha256: str  # of the page
+    file: FileName  # its name
+    # 0 if the page lists segments, otherwise it lists pages of the level below
+    level: Annotated[int, partial(Fields.whole, most=MAX_LEVEL)]
+    first_segment: Whole  # number of the first segment of the page
+    segments: Count  # number of segments in all
+    first_frame: Whole  # number of the first frame
+    frames: Count  # number of frames in all
+    pts_seconds: Pair  # presentation times of the first and the last frame
+    bytes: PageBytes  # length of the page
+    sha256: Sha256  # of the page
 
 
 @dataclass(frozen=True)
 class PartEntry:
     """One frame of the group that is being written."""
 
-    file: str
-    frame: int
-    period: int
-    kind: PacketKind
-    pts_seconds: float
-    bytes: int
-    sha256: str
+    file: FileName
+    frame: Whole
+    period: Whole
+    kind: Annotated[PacketKind, _kind]
+    pts_seconds: Number
+    bytes: FrameBytes
+    sha256: Sha256
 
 
 StoredFile = PeriodEntry | SegmentEntry | HistoryEntry | PartEntry
@@ -260,18 +335,22 @@ StoredFile = PeriodEntry | SegmentEntry | HistoryEntry | PartEntry
 class Manifest:
     """A stream at one moment: pages, then segments, then parts follow each other without gaps."""
 
-    sequence: int  # rises by one with every rewriting
-    live: bool  # False once the run has finished or was stopped
-    fps: float  # of the media
-    name: str  # of the capture
-    target_latency_seconds: float  # how far a player should keep behind the edge
-    frame_seconds: float | None  # mean wall-clock seconds from frame to frame of late; None before the second
-    edge: Edge  # the newest frame
-    window: Window  # what is still there
-    periods: tuple[PeriodEntry, ...]  # of what is listed, the last one is the running one
-    history: tuple[HistoryEntry, ...]  # pages, oldest first
-    segments: tuple[SegmentEntry, ...]  # the newest ones
-    parts: tuple[PartEntry, ...]  # of the group being written, none when live is False
+    sequence: Annotated[int, partial(Fields.whole, most=2**53 - 1)]  # rises by one with every rewriting
+    live: Annotated[bool, Fields.flag]  # False once the run has finished or was stopped
+    fps: Annotated[float, partial(Fields.number, least=MIN_FPS)]  # of the media
+    name: Annotated[str, Fields.text]  # of the capture
+    # how far a player should keep behind the edge
+    target_latency_seconds: Annotated[float, partial(Fields.number, least=0.0)]
+    # mean wall-clock seconds from frame to frame of late; None before the second
+    frame_seconds: Annotated[float | None, partial(Fields.optional, least=0.0)]
+    edge: Annotated[Edge, partial(_object, kind=Edge)]  # the newest frame
+    window: Annotated[Window, partial(_object, kind=Window)]  # what is still there
+    # of what is listed, the last one is the running one
+    periods: Annotated[tuple[PeriodEntry, ...], partial(_list, kind=PeriodEntry)]
+    history: Annotated[tuple[HistoryEntry, ...], partial(_list, kind=HistoryEntry)]  # pages, oldest first
+    segments: Annotated[tuple[SegmentEntry, ...], partial(_list, kind=SegmentEntry)]  # the newest ones
+    # of the group being written, none when live is False
+    parts: Annotated[tuple[PartEntry, ...], partial(_list, kind=PartEntry, most=MAX_GROUP_FRAMES)]
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -284,33 +363,11 @@ def sha256_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def init_name(period: int, sha256: str) -> str:
-    """The name of a period's init record."""
-    return f"init-{period:04d}-{sha256[:16]}.sgs"
-
-
-def part_name(frame: int, sha256: str) -> str:
-    """The name of a frame of the group being written."""
-    return f"part-{frame:08d}-{sha256[:16]}.sgs"
-
-
-def segment_name(segment: int, sha256: str) -> str:
-    """The name of a segment."""
-    return f"segment-{segment:08d}-{sha256[:16]}.sgs"
-
-
-def history_name(first_segment: int, sha256: str) -> str:
-    """The name of a page whose first segment has this number."""
-    return f"history-{first_segment:08d}-{sha256[:16]}.json"
-
-
-MAX_MANIFEST_BYTES = 4 * 2**20
-MAX_PAGE_BYTES = 4 * 2**20
-MAX_ENTRIES = 4096
-MAX_GROUP_FRAMES = 65_536
-MAX_SEGMENT_BYTES = 2**40
-MAX_LEVEL = 8
-MIN_FPS = 1e-9
+def file_name(kind: Literal["init", "part", "segment", "history"], number: int, sha256: str) -> str:
+    """The name of a file: of the init record of a period, of a frame of the group being written, of a segment, or of a
+    page whose first segment has this number."""
+    digits, suffix = 4 if kind == "init" else 8, "json" if kind == "history" else "sgs"
+    return f"{kind}-{number:0{digits}d}-{sha256[:16]}.{suffix}"
 
 
 def manifest_to_json(manifest: Manifest) -> bytes:
@@ -322,31 +379,9 @@ def manifest_to_json(manifest: Manifest) -> bytes:
 def manifest_from_json(data: bytes, *, name: str) -> Manifest:
     """The manifest in ``data``; ``name`` is for messages. Raises StreamError if it is no manifest, of a newer version,
     or contradicts itself or the format's bounds."""
-    top = parse_object(data, name, max_bytes=MAX_MANIFEST_BYTES)
-    if (found := top.text("format")) != FORMAT:
-        raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
-    if (version := top.whole("version")) != VERSION:
-        raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
-    edge, window = top.fields("edge"), top.fields("window")
-    manifest = Manifest(
-        sequence=top.whole("sequence", most=2**53 - 1),
-        live=top.flag("live"),
-        fps=top.number("fps", least=MIN_FPS),
-        name=top.text("name"),
-        target_latency_seconds=top.number("target_latency_seconds", least=0.0),
-        frame_seconds=None if top.is_none("frame_seconds") else top.number("frame_seconds", least=0.0),
-        edge=Edge(
-            frame=edge.whole("frame"),
-            pts_seconds=edge.number("pts_seconds"),
-            captured_unix_seconds=_optional(edge, "captured_unix_seconds"),
-            published_unix_seconds=edge.number("published_unix_seconds"),
-        ),
-        window=Window(window.whole("first_frame"), window.whole("first_segment"), _optional(window, "seconds")),
-        periods=tuple(_period(entry) for entry in top.items("periods", most=MAX_ENTRIES)),
-        history=tuple(_page(entry) for entry in top.items("history", most=MAX_ENTRIES)),
-        segments=tuple(_segment(entry) for entry in top.items("segments", most=MAX_ENTRIES)),
-        parts=tuple(_part(entry) for entry in top.items("parts", most=MAX_GROUP_FRAMES)),
-    )
+    what = "manifest of segments"
+    top = parse_document(data, name, max_bytes=MAX_MANIFEST_BYTES, what=what, format=FORMAT, version=VERSION)
+    manifest = _read(Manifest, top)
     _check(manifest, name)
     return manifest
 
@@ -365,11 +400,11 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
         top.refuse(f"is no history page of {FORMAT} {VERSION}")
     found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]
     if entry.level:
-        found = tuple(_page(one) for one in top.items("history", most=MAX_ENTRIES))
+        found = _list(top, "history", kind=HistoryEntry)
         if any(page.level != entry.level - 1 for page in found):
             top.refuse(f"lists pages of other levels than {entry.level - 1}")
     else:
-        found = tuple(_segment(one) for one in top.items("segments", most=MAX_ENTRIES))
+        found = _list(top, "segments", kind=SegmentEntry)
     _check_run(found, entry.first_segment, entry.first_frame, entry.file)
     counts = sum(one.segments for one in found), sum(one.frames for one in found)
     if counts != (entry.segments, entry.frames):
@@ -379,69 +414,6 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
 
 def _dumped(value: dict[str, Any]) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
-def _optional(fields: Fields, name: str) -> float | None:
-    return None if fields.is_none(name) else fields.number(name)
-
-
-def _period(fields: Fields) -> PeriodEntry:
-    return PeriodEntry(
-        period=fields.whole("period"),
-        file=fields.file(),
-        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
-        sha256=fields.sha256(),
-        first_frame=fields.whole("first_frame"),
-        first_segment=fields.whole("first_segment"),
-    )
-
-
-def _page(fields: Fields) -> HistoryEntry:
-    return HistoryEntry(
-        file=fields.file(),
-        level=fields.whole("level", most=MAX_LEVEL),
-        first_segment=fields.whole("first_segment"),
-        segments=fields.whole("segments", least=1),
-        first_frame=fields.whole("first_frame"),
-        frames=fields.whole("frames", least=1),
-        pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MAX_PAGE_BYTES),
-        sha256=fields.sha256(),
-    )
-
-
-def _segment(fields: Fields) -> SegmentEntry:
-    frames = fields.whole("frames", least=1, most=MAX_GROUP_FRAMES)
-    entry = SegmentEntry(
-        segment=fields.whole("segment"),
-        file=fields.file(),
-        period=fields.whole("period"),
-        first_frame=fields.whole("first_frame"),
-        frames=frames,
-        pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
-        key_bytes=fields.whole("key_bytes", least=1, most=2**33),
-        frame_bytes=fields.wholes("frame_bytes", count=frames, least=1, most=2**33),
-        sha256=fields.sha256(),
-    )
-    if sum(entry.frame_bytes) != entry.bytes or entry.key_bytes != entry.frame_bytes[0]:
-        fields.refuse("states lengths of frames that are not those of the segment")
-    return entry
-
-
-def _part(fields: Fields) -> PartEntry:
-    kinds = {kind.name.lower(): kind for kind in PacketKind}
-    if (kind := fields.text("kind", most=20)) not in kinds:
-        fields.refuse(f"has 'kind' {kind!r}; expected {' or '.join(kinds)}")
-    return PartEntry(
-        file=fields.file(),
-        frame=fields.whole("frame"),
-        period=fields.whole("period"),
-        kind=kinds[kind],
-        pts_seconds=fields.number("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=2**33),
-        sha256=fields.sha256(),
-    )
 
 
 def _check(manifest: Manifest, name: str) -> None:

@@ -86,9 +86,7 @@ class MirroredStore:
                 self._waiting[name] = None
                 self._gone.pop(name, None)
                 return
-            self._manifest_waits = True
-            self._started()
-            self._changed.notify_all()
+            self._begin_round()
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """From the folder."""
@@ -149,9 +147,7 @@ class MirroredStore:
         if MANIFEST not in self._folder.names():
             return
         with self._changed:
-            self._manifest_waits = True
-            self._started()
-            self._changed.notify_all()
+            self._begin_round()
 
     def finish(self, *, wait_seconds: float) -> int:
         """Wait until everything is copied, at most this long, and end the thread.
@@ -182,10 +178,13 @@ class MirroredStore:
         stale = stale_files(named, frozenset(self._waiting))
         return [name for name in self._waiting if name not in stale], manifest
 
-    def _started(self) -> None:
+    def _begin_round(self) -> None:
+        """While nothing else changes."""
+        self._manifest_waits = True
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="segments-mirror", daemon=True)
             self._thread.start()
+        self._changed.notify_all()
 
     def _run(self) -> None:
         while True:

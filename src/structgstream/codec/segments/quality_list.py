@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from structgstream.atomic_files import atomic_write
-from structgstream.codec.segments.manifest import MANIFEST, Fields, parse_object
+from structgstream.codec.segments.manifest import MANIFEST, Fields, parse_document
 from structgstream.codec.segments.store import read_bounded
 from structgstream.errors import StreamError
 
@@ -52,11 +52,8 @@ def list_to_json(qualities: Sequence[ListedQuality]) -> bytes:
 def list_from_json(data: bytes, *, name: str) -> tuple[ListedQuality, ...]:
     """The qualities in ``data``; ``name`` is for messages. Raises StreamError if it is no list of qualities, of a newer
     version, or leaves the bounds of players."""
-    top = parse_object(data, name, max_bytes=MAX_LIST_BYTES)
-    if (found := top.text("format")) != FORMAT:
-        raise StreamError(f"{name} is no list of qualities: its format is {found!r}; expected {FORMAT!r}.")
-    if (version := top.whole("version")) != VERSION:
-        raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
+    what = "list of qualities"
+    top = parse_document(data, name, max_bytes=MAX_LIST_BYTES, what=what, format=FORMAT, version=VERSION)
     qualities = tuple(_quality(entry) for entry in top.items("qualities", most=MAX_QUALITIES))
     if not qualities:
         raise StreamError(f"{name} lists no quality.")

@@ -9,6 +9,7 @@ with the same names and bytes.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 from structgstream.codec.container.records import (
     FRAME,
@@ -30,9 +31,7 @@ from structgstream.codec.segments.manifest import (
     PeriodEntry,
     SegmentEntry,
     Window,
-    init_name,
-    part_name,
-    segment_name,
+    file_name,
     sha256_of,
 )
 from structgstream.codec.segments.store import Store
@@ -48,7 +47,7 @@ def part_of(record: bytes) -> PartEntry:
     frame, pts_seconds = FRAME.unpack_from(found.payload)
     sha256 = sha256_of(record)
     kind = PACKET_KINDS[found.type]
-    return PartEntry(part_name(frame, sha256), frame, found.period, kind, pts_seconds, len(record), sha256)
+    return PartEntry(file_name("part", frame, sha256), frame, found.period, kind, pts_seconds, len(record), sha256)
 
 
 def segment_of(parts: Sequence[PartEntry], data: bytes, *, segment: int) -> SegmentEntry:
@@ -56,7 +55,7 @@ def segment_of(parts: Sequence[PartEntry], data: bytes, *, segment: int) -> Segm
     sha256 = sha256_of(data)
     return SegmentEntry(
         segment=segment,
-        file=segment_name(segment, sha256),
+        file=file_name("segment", segment, sha256),
         period=parts[0].period,
         first_frame=parts[0].frame,
         frames=len(parts),
@@ -66,15 +65,6 @@ def segment_of(parts: Sequence[PartEntry], data: bytes, *, segment: int) -> Segm
         frame_bytes=tuple(part.bytes for part in parts),
         sha256=sha256,
     )
-
-
-def records_of(entry: SegmentEntry, data: bytes) -> list[bytes]:
-    """The records of each frame of a segment."""
-    records, start = [], 0
-    for size in entry.frame_bytes:
-        records.append(data[start : start + size])
-        start += size
-    return records
 
 
 @dataclass(frozen=True)
@@ -96,7 +86,7 @@ def init_file(header: StreamHeader, number: int) -> bytes:
 def period_entry(data: bytes, number: int, *, first_frame: int, first_segment: int) -> PeriodEntry:
     """The entry of a period whose file is ``data``."""
     sha256 = sha256_of(data)
-    return PeriodEntry(number, init_name(number, sha256), len(data), sha256, first_frame, first_segment)
+    return PeriodEntry(number, file_name("init", number, sha256), len(data), sha256, first_frame, first_segment)
 
 
 def empty_manifest(header: StreamHeader, period: PeriodEntry, *, sequence: int = 0) -> Manifest:
@@ -142,17 +132,17 @@ def reopened(draft: Draft, store: Store) -> Draft:
     StreamError if the segment is missing or damaged."""
     manifest = draft.manifest
     *before, last = manifest.segments
-    records = records_of(last, verified(store, last))
-    parts = tuple(part_of(record) for record in records)
-    files = tuple((part.file, record) for part, record in zip(parts, records, strict=True))
-    return Draft(replace(manifest, segments=tuple(before), parts=parts), tuple(records), (*draft.files, *files))
+    data, ends = verified(store, last), accumulate(last.frame_bytes)
+    records = tuple(data[end - size : end] for size, end in zip(last.frame_bytes, ends))
+    parts = tuple(map(part_of, records))
+    files = ((part.file, record) for part, record in zip(parts, records))
+    return Draft(replace(manifest, segments=tuple(before), parts=parts), records, (*draft.files, *files))
 
 
 def next_segment(manifest: Manifest) -> int:
     """Number of the segment after the last one."""
-    if manifest.segments:
-        return manifest.segments[-1].segment + 1
-    return manifest.history[-1].first_segment + manifest.history[-1].segments if manifest.history else 0
+    last = [*manifest.history, *manifest.segments][-1:]
+    return last[0].first_segment + last[0].segments if last else 0
 
 
 def running_period(manifest: Manifest) -> PeriodEntry:
@@ -192,13 +182,9 @@ _NAME = re.compile(r"(init|part|segment|history)-(\d+)-([0-9a-f]{16})\.")
 
 
 def find(store: Store) -> Draft | None:
-    """The stream in a store with every frame that was written, to go on after it.
-
-    None if there is no whole frame: the stream then begins again. Nothing is changed.
-
-    Raises:
-        StreamError: the store cannot be read, or what is there is damaged so that it cannot be continued.
-    """
+    """The stream in a store with every frame that was written, to go on after it; None if there is no whole frame: the
+    stream then begins again. Nothing is changed. Raises StreamError if the store cannot be read, or what is there is
+    damaged so that it cannot be continued."""
     there = store.names()
     draft = _named(store, there) if MANIFEST in there else _unnamed(store, there)
     if draft is None:
@@ -219,9 +205,8 @@ def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
 
     The first segment of the running period stays: resuming needs its first frame.
     """
-    first, listed = manifest.window.first_segment, min([entry.segment for entry in manifest.segments] or [0])
-    listed = listed if manifest.segments else next_segment(manifest)
-    kept = running_period(manifest).first_segment
+    first, kept = manifest.window.first_segment, running_period(manifest).first_segment
+    listed = manifest.segments[0].segment if manifest.segments else next_segment(manifest)
     named = {entry.file for entry in (*manifest.periods, *manifest.history, *manifest.parts)}
     named |= {one.file for one in manifest.segments if one.segment >= first or one.segment == kept} | {MANIFEST}
     stale = set()

@@ -17,14 +17,7 @@ from dataclasses import dataclass, replace
 from structgstream.codec.container.byte_source import check_room
 from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, sound_record
-from structgstream.codec.segments.manifest import (
-    MANIFEST,
-    Edge,
-    Manifest,
-    SegmentEntry,
-    Window,
-    manifest_to_json,
-)
+from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, SegmentEntry, Window, manifest_to_json
 from structgstream.codec.segments.recovery import (
     Draft,
     empty_manifest,
@@ -125,10 +118,6 @@ _LATENCY_FRAMES = 3.0
 _ENTRY_BYTES = 1024
 
 
-def _unknown(frame: int) -> float | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Clocks:
     """Where times come from."""
@@ -136,7 +125,7 @@ class Clocks:
     wall: Callable[[], float] = time.time  # seconds since 1970
     elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
     # when a frame was filmed, by its number, in seconds since 1970; None where that is not known
-    captured: Callable[[int], float | None] = _unknown
+    captured: Callable[[int], float | None] = lambda frame: None
 
 
 class SegmentsSink:
@@ -215,10 +204,7 @@ class SegmentsSink:
 
     def close(self) -> None:
         """Finish the group as a segment and say in the manifest that the run has ended. A second call does nothing.
-
-        Raises:
-            StorageError: no room; all frames are safe.
-        """
+        Raises StorageError if there is no room; all frames are safe."""
         draft = self._draft
         try:
             if draft is None or draft.manifest.edge.frame < 0:

@@ -76,6 +76,14 @@ class Store(Protocol):
         ...
 
 
+@contextmanager
+def _storage_errors(what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{what} ({error.strerror or error}).") from error
+
+
 class FolderStore:
     """A folder. A file is written under a temporary name, synced, and renamed; then the folder is synced."""
 
@@ -89,53 +97,40 @@ class FolderStore:
 
     def make(self) -> None:
         """Make the folder, if it is not there. Raises StorageError if it cannot be made, or it is a file."""
-        try:
+        with _storage_errors(f"The folder {self.folder} cannot be made"):
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
 
     def prepare(self) -> None:
         """Make the folder, and remove the temporary files of a writer that was killed. Raises StorageError if the
         folder cannot be made or changed, or it is a file."""
         self.make()
-        try:
+        with _storage_errors(f"{self.folder} cannot be changed"):
             for path in self.folder.glob(f"{_TEMPORARY}*"):
                 name = path.name.removeprefix(_TEMPORARY)
                 if is_ours(name) or name == MARKER:
                     path.unlink(missing_ok=True)
-        except OSError as error:
-            raise StorageError(f"{self.folder} cannot be changed ({error.strerror}).") from error
 
     def lock(self) -> None:
         """Keep other processes from writing here, until this one ends or forgets the store. Raises StorageError if
         another process writes here, or the lock's file cannot be opened, or is a link."""
-        path = self.folder / _LOCK
-        try:
-            file = open_lockable(path)
-        except OSError as error:
-            raise StorageError(f"{self.folder} cannot be written ({error.strerror}).") from error
+        with _storage_errors(f"{self.folder} cannot be written"):
+            file = open_lockable(self.folder / _LOCK)
         if not lock_file(file, holder="process"):
             file.close()
             raise StorageError(f"Another process writes to {self.folder}; wait for its end, or choose another folder.")
         weakref.finalize(self, file.close)
 
     def put(self, name: str, data: bytes) -> None:
-        try:
-            with replacing(self.folder / name, partial=self.folder / f"{_TEMPORARY}{name}") as file:
-                file.write(data)
-        except OSError as error:
-            raise StorageError(
-                f"Cannot write {len(data)} bytes to {self.folder / name} ({error.strerror or error})."
-            ) from error
+        path, temporary = self.folder / name, self.folder / f"{_TEMPORARY}{name}"
+        with _storage_errors(f"Cannot write {len(data)} bytes to {path}"), replacing(path, partial=temporary) as file:
+            file.write(data)
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         return read_bounded(self.folder / name, max_bytes=MAX_FILE_BYTES if max_bytes is None else max_bytes)
 
     def delete(self, name: str) -> None:
-        try:
+        with _storage_errors(f"Cannot remove {self.folder / name}"):
             (self.folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise StorageError(f"Cannot remove {self.folder / name} ({error.strerror}).") from error
 
     def names(self) -> frozenset[str]:
         try:

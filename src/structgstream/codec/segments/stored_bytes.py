@@ -3,14 +3,15 @@
 
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from structgstream.atomic_files import atomic_write
-from structgstream.codec.container.records import PREFIX, PacketKind, Period, RecordType, pack_index
+from structgstream.codec.container.records import PREFIX, RECORD_TYPES, PacketKind, Period, RecordType, pack_index
 from structgstream.codec.segments.manifest import (
     LISTED_SEGMENTS,
     MANIFEST,
@@ -22,7 +23,7 @@ from structgstream.codec.segments.manifest import (
     PartEntry,
     SegmentEntry,
     StoredFile,
-    history_name,
+    file_name,
     manifest_from_json,
     page_from_json,
     page_to_json,
@@ -65,7 +66,7 @@ def _page(
     data = page_to_json(entries)
     sha256 = sha256_of(data)
     first = entries[0]
-    pages.append((history_name(first.first_segment, sha256), data))
+    pages.append((file_name("history", first.first_segment, sha256), data))
     return HistoryEntry(
         file=pages[-1][0],
         level=level,
@@ -160,12 +161,13 @@ class StoredBytes:
         self.periods: list[Period] = []
         self._periods = {period.period: period for period in manifest.periods}
         self._period: int | None = None  # whose init record has been added
-        entries: list[tuple[int, int, int]] = []
+        self._index: list[tuple[int, int, int]] = []  # its entries
         there = store.names() | self._held.keys()
-        for entry in self._listed(manifest):
-            self._add_frames(entry, there, manifest, entries)
+        segments = segments_from(store, manifest.history, manifest.segments, held=self._held)
+        for entry in chain(segments, manifest.parts):
+            self._add_frames(entry, there, first_segment=manifest.window.first_segment)
         if not manifest.live:
-            self._add(pack_index(entries, self._size))
+            self._add(pack_index(self._index, self._size))
 
     def __len__(self) -> int:
         return self._size
@@ -196,15 +198,11 @@ class StoredBytes:
         for piece in self._pieces:
             yield self._content(piece)
 
-    def _listed(self, manifest: Manifest) -> Iterator[SegmentEntry | PartEntry]:
-        yield from segments_from(self._store, manifest.history, manifest.segments, held=self._held)
-        yield from manifest.parts
-
     def _add(self, content: StoredFile | bytes, *, skipped: int = 0) -> None:
         self._pieces.append(_Piece(self._size, content, skipped))
         self._size += (len(content) if isinstance(content, bytes) else content.bytes) - skipped
 
-    def _add_period(self, number: int, frame: int, entries: list[tuple[int, int, int]]) -> None:
+    def _add_period(self, number: int, frame: int) -> None:
         """Add the init record of a period, whose first frame that is there follows, if it is another than before."""
         if number == self._period:
             return
@@ -213,20 +211,15 @@ class StoredBytes:
         first = self._period is None
         self._period = number
         if not first:
-            entries.append((frame, RecordType.INIT, self._size))
+            self._index.append((frame, RecordType.INIT, self._size))
         # Every file of a period begins with a prefix, and a stream has one.
         offset, size = self._size + (PREFIX.size if first else 0), self._periods[number].bytes - PREFIX.size
         self.periods[-1] = replace(self.periods[-1], offset=offset, bytes=size)
         self._add(self._periods[number], skipped=0 if first else PREFIX.size)
 
-    def _add_frames(
-        self,
-        entry: SegmentEntry | PartEntry,
-        there: frozenset[str] | set[str],
-        manifest: Manifest,
-        entries: list[tuple[int, int, int]],
-    ) -> None:
-        """Add a segment or a part, and what an index says of it."""
+    def _add_frames(self, entry: SegmentEntry | PartEntry, there: Set[str], *, first_segment: int) -> None:
+        """Add a segment or a part, if it is ``there``, and what an index says of it; the window begins with
+        ``first_segment``."""
         if isinstance(entry, PartEntry):
             first, sizes, kinds, seconds = entry.frame, (entry.bytes,), [entry.kind], [entry.pts_seconds]
         else:
@@ -238,7 +231,7 @@ class StoredBytes:
         self.sizes += sizes
         self.kinds += kinds
         self.seconds += seconds
-        left = isinstance(entry, SegmentEntry) and entry.segment < manifest.window.first_segment
+        left = isinstance(entry, SegmentEntry) and entry.segment < first_segment
         # In its time of grace a segment is there, though the manifest no longer names its period's init record.
         if entry.file not in there or (left and entry.period not in self._periods):
             if not left:
@@ -246,10 +239,10 @@ class StoredBytes:
             last = self.gone.pop() if self.gone and self.gone[-1].stop == first else range(first, first)
             self.gone.append(range(last.start, first + len(sizes)))
             return
-        self._add_period(entry.period, first, entries)
+        self._add_period(entry.period, first)
         offset = self._size
         for index, (size, kind) in enumerate(zip(sizes, kinds, strict=True), start=first):
-            entries.append((index, RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, offset))
+            self._index.append((index, RECORD_TYPES[kind], offset))
             offset += size
         self._add(entry)
 
@@ -257,16 +250,12 @@ class StoredBytes:
         content = piece.content
         if isinstance(content, bytes):
             return content
-        return self._file(content)[piece.skipped :]
-
-    def _file(self, content: StoredFile) -> bytes:
         name = content.file
         if name not in self._cache:
-            data = self._held[name] if name in self._held else self._read(content)
-            self._cache[name] = data
+            self._cache[name] = self._held[name] if name in self._held else self._read(content)
             if len(self._cache) > _KEPT_FILES:
                 self._cache.popitem(last=False)
-        return self._cache[name]
+        return self._cache[name][piece.skipped :]
 
     def _read(self, entry: StoredFile) -> bytes:
         if self._check:
