@@ -10,9 +10,8 @@ import pytest
 
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.sound import unpack_sound
-from structgstream.data.live.sound import LiveSound
 from structgstream.data.open import open_capture
-from structgstream.data.sound import SoundEncoder, SoundFile, camera_clock, start_seconds
+from structgstream.data.sound import LiveSound, SoundEncoder, SoundFile, camera_clock, start_seconds
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.opus import PACKET_SECONDS, OpusPacket

@@ -26,9 +26,9 @@ from hypothesis import strategies as st
 
 from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed, ClockMapper, ClockResets, PictureTime
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
-from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
+from structgstream.data.sound import LiveSound
 from tests.support.properties import examples
 from tests.support.sender_modules import coded_film, moving_pictures, number_shown, sent_stream
 
@@ -343,7 +343,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
     feed, faults = camera_feed(Received(), base=base)
     frames = [SimpleNamespace(pts=None, time_base=None)] * 60
     with caplog.at_level(logging.WARNING):
-        placed = [feed._common_time(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
+        placed = [feed._common_time(frame, n * PERIOD) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
     assert placed[:MAX_UNSTAMPED] == [None] * MAX_UNSTAMPED
     assert faults.counts["a"] == {"no stamp": 60}
     if base is TimeBase.ARRIVAL:
@@ -353,7 +353,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert placed == [None] * 60
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
-    assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+    assert feed._common_time(stamped, 61 * PERIOD) is not None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ def test_stamps_that_are_no_unix_time_are_told(stamp: float, caplog: pytest.LogC
     with caplog.at_level(logging.WARNING):
         for number in range(3):
             frame: Any = SimpleNamespace(pts=stamp + number, time_base=1)
-            assert feed._common_time(frame, 1.7e9 - 1000.0 + number, None) == stamp + number
+            assert feed._common_time(frame, 1.7e9 - 1000.0 + number) == stamp + number
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == (0 if stamp == 1.7e9 else 1)
     assert all("sends time stamps 1699999000 s from the Unix time of this machine; set the" in text for text in said)

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
-from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, PictureSet
+from structgstream.data.sound import LiveSound
 
 TICK_SECONDS = 0.02
 MAX_MISSED_SETS = 30  # before a camera is reported as out of step
