@@ -24,7 +24,7 @@ def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamF
     for length in (0, 5, 12, 13, HEADER_BYTES - 1, HEADER_BYTES, HEADER_BYTES + 3, len(STREAM) - 1, len(STREAM)):
         file.path.write_bytes(STREAM[:length])
         assert file.has_header() == (length >= HEADER_BYTES)
-        assert file.state() == (length, length == len(STREAM))
+        assert file.state() == {"bytes": length, "complete": length == len(STREAM)}
 
 
 @pytest.mark.parametrize(

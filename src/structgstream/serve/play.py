@@ -84,14 +84,8 @@ class Truth:
 
 
 def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
-    """The application; each request opens the file anew, so it may grow meanwhile.
-
-    Args:
-        truth: the capture's pictures to compare with, or None.
-
-    Raises:
-        PlayerError: the installation lacks the player.
-    """
+    """The application; each request opens the file anew, so it may grow meanwhile. ``truth`` is the capture's pictures
+    to compare with. Raises PlayerError if the installation lacks the player."""
     module = bundle()
     page = linked_page(stream.path.name, stream="stream", attributes={"truth": "truth.json"} if truth else {})
     # A growing file may differ in each response, so responses are not cached and have no validators.
@@ -105,8 +99,7 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
         return Response(module, media_type="text/javascript", headers=headers)
 
     def state(request: Request) -> Response:
-        size_bytes, complete = stream.state()
-        return JSONResponse({"bytes": size_bytes, "complete": complete}, headers=headers)
+        return JSONResponse(stream.state(), headers=headers)
 
     def stream_bytes(request: Request) -> Response:
         return file_response(stream.opened(), request, headers)
