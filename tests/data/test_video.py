@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Videos as a capture, matched by time stamp, and their pictures, also where a file is damaged."""
+
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +11,22 @@ import numpy as np
 import pytest
 
 from structgstream.data.timeline import Clock
-from structgstream.data.video import VideoSource, measured_fps, synchronised
+from structgstream.data.video import VideoSource, measured_fps, pictures_at, synchronised
 from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
-from tests.support.captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
+from tests.support.captures import (
+    FULL,
+    HEIGHT,
+    LIMITED,
+    WIDTH,
+    Picture,
+    all_numbers,
+    numbers,
+    picture,
+    small_rig,
+    write_video,
+    write_videos,
+)
 
 RIG = small_rig(3)
 
@@ -198,20 +213,28 @@ def test_a_truncated_video_is_found_at_once(tmp_path: Path, kept: float) -> None
         read(tmp_path)
 
 
+def noise(frames: int) -> list[Picture]:
+    """Pictures of large files, so that damage hits data."""
+    return [*np.random.default_rng(3).integers(0, 255, (frames, HEIGHT, WIDTH, 3), dtype=np.uint8)]
+
+
+def damage(path: Path, share: float) -> None:
+    """Zeros in place of what follows ``share`` of a file."""
+    data = bytearray(path.read_bytes())
+    middle = int(len(data) * share)
+    for at in range(middle, min(middle + 4000, len(data))):
+        if path.suffix != ".ts" or at % 188 >= 20:  # headers of transport packets stay
+            data[at] = 0
+    path.write_bytes(data)
+
+
 def damaged(
     folder: Path, *, suffix: str = "mp4", share: float = 0.6, options: dict[str, str] | None = None
 ) -> VideoSource:
-    """Videos of noise, large, so that damage hits data; that of ``cam01`` is broken from ``share`` of it on."""
-    rng = np.random.default_rng(3)
-    noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(24)]
+    """Videos of noise; that of ``cam01`` is broken from ``share`` of it on."""
     for name in RIG:
-        write_video(folder / f"{name}.{suffix}", noise, options=options)
-    data = bytearray((folder / f"cam01.{suffix}").read_bytes())
-    middle = int(len(data) * share)
-    for at in range(middle, middle + 4000):
-        if suffix != "ts" or at % 188 >= 20:  # headers of transport packets stay
-            data[at] = 0
-    (folder / f"cam01.{suffix}").write_bytes(data)
+        write_video(folder / f"{name}.{suffix}", noise(24), options=options)
+    damage(folder / f"cam01.{suffix}", share)
     return read(folder, suffix=suffix)
 
 
@@ -313,3 +336,54 @@ def test_the_extra_is_named_when_the_reader_is_absent(tmp_path: Path, monkeypatc
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
         scan_videos({"a": tmp_path / "a.mp4"})
+
+
+def track_of(folder: Path, pictures: list[Picture]) -> VideoTrack:
+    write_video(folder / "a.mp4", pictures)
+    return scan_videos({"a": folder / "a.mp4"})["a"]
+
+
+@pytest.fixture
+def track(tmp_path: Path) -> VideoTrack:
+    """Numbered pictures with B-frames, in groups of four."""
+    return track_of(tmp_path, [picture(3, number) for number in range(16)])
+
+
+def read_at(track: VideoTrack, stamps: list[int | None]) -> tuple[list, list[tuple[int, int | None, str]]]:
+    """Pictures at time stamps, and what is reported as damage."""
+    damages: list[tuple[int, int | None, str]] = []
+    shown = pictures_at(track, stamps, size=(WIDTH, HEIGHT), on_damage=lambda *reported: damages.append(reported))
+    return [None if one is None else one[0] for one in shown], damages
+
+
+def test_any_ascending_choice_of_frames_is_exact(track: VideoTrack) -> None:
+    for chosen in ([0, 1, 2], [5], [2, 7, 15], [11, 12]):
+        found, damages = read_at(track, [track.stamps[number] for number in chosen])
+        assert [numbers(image) for image in found] == [(3, number) for number in chosen]
+        assert damages == []
+
+
+def test_where_nothing_is_wanted_there_is_no_picture(track: VideoTrack) -> None:
+    found, _ = read_at(track, [None, track.stamps[4], None, track.stamps[6], None])
+    assert [image is None for image in found] == [True, False, True, False, True]
+    assert [numbers(image) for image in found if image is not None] == [(3, 4), (3, 6)]
+    gone = replace(track, path=track.path.with_name("gone.mp4"))
+    assert read_at(gone, [None, None]) == ([None, None], [])  # not even opened
+
+
+def test_a_video_whose_size_changes_is_refused_where_it_does(track: VideoTrack) -> None:
+    larger = replace(track, width=2 * WIDTH, height=2 * HEIGHT)  # As its first frames may have had.
+    with pytest.raises(CaptureError, match=r"changes its size from 128x96 to 64x48 at 0\.3"):
+        read_at(larger, [track.stamps[9]])
+
+
+@pytest.mark.parametrize("share", [0.6, 0.97])
+def test_damage_is_reported_with_what_is_lost_up_to_the_next_key_frame(tmp_path: Path, share: float) -> None:
+    track = track_of(tmp_path, noise(16))
+    damage(track.path, share)
+    found, ((lost, following, reason),) = read_at(track, list(track.stamps))
+    end = len(track.stamps) if following is None else track.stamps.index(following)
+    assert [number for number, image in enumerate(found) if image is None] == list(range(track.stamps.index(lost), end))
+    assert (following is None) == (share == 0.97)
+    assert following is None or following in track.keyframes
+    assert reason

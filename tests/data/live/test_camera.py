@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed, ClockMapper, ClockResets, PictureTime
-from structgstream.data.live.rig_file import LiveCamera, TimeBase
+from structgstream.data.live.rig_file import LiveCamera, LiveRig, TimeBase
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
 from structgstream.data.sound import LiveSound
@@ -74,16 +74,14 @@ def camera_feed(
     ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
     feed = CameraFeed(
         "a",
-        camera,
+        LiveRig("rig", Path(), {"a": camera}, clock=base, stuck_seconds=1.0),
         size=(128, 96),
         synchronizer=received,  # type: ignore[arg-type]
         changed_at=received.changed_at,
-        clock=clock(base),
+        resets=ClockResets(),
         faults=faults,
         now=lambda: next(ticks) * tick,
         unix_offset=1000.0,
-        silent_seconds=5.0,
-        stuck_seconds=1.0,
         **options,
     )
     return feed, faults

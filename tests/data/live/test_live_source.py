@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole live sources over loopback and over files: small streams, a second or two each."""
+"""Whole live sources over loopback and over files, small streams of a second or two each; lenses, masks and sizes of
+their calibration."""
 
 import io
 import threading
@@ -14,20 +15,23 @@ import av
 import numpy as np
 import pytest
 
+from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 from structgstream.data.denoising import DenoisingConfig
-from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.live import recorder as recording
 from structgstream.data.live import source as source_module
 from structgstream.data.live.source import LiveOptions, LiveSource, read_calibration
 from structgstream.data.live.status import FaultLog
 from structgstream.data.live.synchronizer import LivePicture, PictureSet
 from structgstream.data.open import open_capture
-from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, filmed_rig, write_prepared
 from structgstream.data.source import frame_count, is_recording
+from structgstream.data.undistortion import Undistortion
 from structgstream.data.video import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
+from structgstream.frames import MultiViewFrame
 from structgstream.opus import PACKET_SECONDS
-from tests.support.captures import write_picture
+from tests.support.captures import small_rig, write_picture
 from tests.support.rigs import arc_rig
 from tests.support.sender_modules import coded_film, moving_pictures, number_shown, sender, sent_loops, sent_stream
 from tests.support.sounds import add_sound, claps, packets_heard
@@ -491,3 +495,53 @@ def test_a_camera_that_sends_no_sound_is_said_and_one_that_is_not_there_refused(
     source = live(path, sound="b")
     assert len(list(source.frames())) > 0
     assert sum("sends no sound, which --sound asks for" in record.message for record in caplog.records) == 1
+
+
+def prepared(folder: Path) -> PreparedCapture:
+    """A prepared capture of one lens that distorts, whose videos are not there."""
+    rig = small_rig()
+    cameras = {
+        name: PreparedCamera(f"{name}.mp4", LensCamera(rig[name], RadialTangential(k1=k1)), rig[name])
+        for name, k1 in zip(rig, (0.0, -0.15, 0.0, 0.0), strict=True)
+    }
+    capture = PreparedCapture(cameras, 25.0, 0.1, held_out=frozenset([next(iter(rig))]))
+    write_prepared(folder, capture)
+    return capture
+
+
+def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
+    capture, path = prepared(tmp_path), tmp_path / "rig.toml"
+    filmed = filmed_rig(tmp_path, capture)
+    path.write_text('calibration = "."\n' + "".join(f'[cameras.{name}]\nurl = "udp://{name}"\n' for name in filmed))
+    random = np.random.default_rng(0)
+    images = {
+        name: random.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
+        for name, camera in filmed.cameras.items()
+    }
+    frames = [MultiViewFrame(0, 3.25, images, captured_unix_seconds=5.0)]
+    source = live(path, near=0.3)
+    (frame,) = source._calibrated(iter(frames)).frames()
+    second = [*images][1]
+    expected = Undistortion(capture.cameras[second].filmed, capture.cameras[second].pinhole)(images[second])
+    assert (frame.images[second] == expected).all()
+    assert (expected != images[second]).any()
+    assert (frame.pts_seconds, frame.captured_unix_seconds) == (3.25, 5.0)
+    assert source.rig[second].near == 0.3
+    half = live(path, held_out=(second,), scale=0.5)
+    assert half.rig.testing == (second,)
+    (small,) = half._calibrated(iter(frames)).frames()
+    assert small.images[second].shape == (half.rig[second].height, half.rig[second].width, 3)
+    assert half.rig[second].width == round(filmed[second].width / 2)
+
+
+def test_a_capture_of_another_layout_gives_its_rig() -> None:
+    capture = read_calibration(bundled_clip_path())
+    clip = bundled_clip()
+    assert capture.held_out == clip.rig.held_out
+    assert capture.near == pytest.approx(clip.rig["cam03"].near)
+    chosen = capture.only(["cam02", "cam01", "cam05"])
+    assert [*chosen.cameras] == ["cam01", "cam02", "cam05"]
+    assert chosen.held_out == frozenset()
+    rig = filmed_rig(bundled_clip_path(), capture)
+    assert (rig["cam03"].K == clip.rig["cam03"].K).all()
+    assert (rig["cam03"].viewmat == clip.rig["cam03"].viewmat).all()

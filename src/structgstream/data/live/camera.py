@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from structgstream.data.live.recorder import CameraRecorder
-from structgstream.data.live.rig_file import LiveCamera, TimeBase
+from structgstream.data.live.rig_file import LiveCamera, LiveRig, TimeBase
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
 from structgstream.data.sound import LiveSound
@@ -202,8 +202,7 @@ class CameraFeed:
         size: width and height of the calibration's pictures.
         changed_at: by camera, when its picture last changed, monotonic seconds; shared by all feeds.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
-        silent_seconds: without packets for this time, the camera is opened again.
-        stuck_seconds: a picture that does not change for this time is not used if others change.
+        resets: shared by all feeds.
         open_camera: opens a camera with a timeout in seconds.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
         sound: receives the camera's sound; None where that is not wanted.
@@ -212,27 +211,24 @@ class CameraFeed:
     def __init__(
         self,
         name: str,
-        camera: LiveCamera,
+        rig: LiveRig,
         *,
         size: tuple[int, int],
         synchronizer: FrameSynchronizer,
         changed_at: dict[str, float],
-        clock: ClockMapper,
+        resets: ClockResets,
         faults: FaultLog,
         now: Callable[[], float],
         unix_offset: float,
-        silent_seconds: float,
-        stuck_seconds: float,
         recorder: CameraRecorder | None = None,
         open_camera: Callable[[LiveCamera, float], AbstractContextManager[Any]] = open_with_pyav,
         wait: Callable[[float], object] | None = None,
         sound: LiveSound | None = None,
     ) -> None:
-        self.name, self._camera, self._size = name, camera, size
-        self._synchronizer, self._changed_at = synchronizer, changed_at
-        self._clock, self._faults = clock, faults
+        self.name, self._rig, self._camera, self._size = name, rig, rig.cameras[name], size
+        self._clock = ClockMapper(rig.clock, resets=resets, offset_seconds=self._camera.offset_seconds)
+        self._synchronizer, self._changed_at, self._faults = synchronizer, changed_at, faults
         self._now, self._unix_offset = now, unix_offset
-        self._silent, self._stuck = silent_seconds, stuck_seconds
         self._recorder, self._sound, self._open_camera = recorder, sound, open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
@@ -282,10 +278,10 @@ class CameraFeed:
         """Reads until the connection ends; why it did."""
         av = load_av()
         try:
-            with self._open_camera(self._camera, self._silent) as container:
+            with self._open_camera(self._camera, self._rig.silent_seconds) as container:
                 self._read(container)
         except av.error.ExitError:
-            return f"nothing came for {self._silent:g} s"
+            return f"nothing came for {self._rig.silent_seconds:g} s"
         except (av.error.FFmpegError, OSError, ValueError) as error:
             return str(getattr(error, "strerror", None) or error)
         except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
@@ -501,7 +497,7 @@ class CameraFeed:
             return False
         changed_at = self._changed_at[self.name]
         others = (seconds for name, seconds in self._changed_at.items() if name != self.name)
-        if max(others, default=changed_at) - changed_at < self._stuck:
+        if max(others, default=changed_at) - changed_at < self._rig.stuck_seconds:
             return False
         text = f"has sent the same picture for {arrived - changed_at:.1f} s; it is absent until that changes"
         self._report_absent(Fault.STUCK, text)

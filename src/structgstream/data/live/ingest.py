@@ -4,7 +4,7 @@
 import threading
 from collections.abc import Callable, Mapping
 
-from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets
+from structgstream.data.live.camera import CameraFeed, ClockResets
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.status import Fault, FaultLog
@@ -59,20 +59,18 @@ class Ingest:
         self.feeds = {
             name: CameraFeed(
                 name,
-                camera,
+                rig,
                 size=sizes[name],
                 synchronizer=self._synchronizer,
                 changed_at=changed_at,
-                clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
+                resets=resets,
                 faults=faults,
                 now=now,
                 unix_offset=unix_offset,
-                silent_seconds=rig.silent_seconds,
-                stuck_seconds=rig.stuck_seconds,
                 recorder=None if recording is None else recording.camera(name, faults),
                 sound=sound if sound is not None and sound.name == name else None,
             )
-            for name, camera in rig.cameras.items()
+            for name in rig.cameras
         }
         self._thread = threading.Thread(target=self._synchronize, name="synchronizer", daemon=True)
 
@@ -115,11 +113,7 @@ class Ingest:
 
     @property
     def end_reason(self) -> str | None:
-        """Why no more pictures will arrive; None while they may.
-
-        Raises:
-            BaseException: what ended the synchroniser's thread.
-        """
+        """Why no more pictures will arrive; None while they may. Raises what ended the synchroniser's thread."""
         if self._failure is not None:
             raise self._failure
         if self._newest is not None:

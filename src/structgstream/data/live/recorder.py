@@ -50,14 +50,9 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
 
 class Recording:
-    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part.
-
-    Args:
-        masks: folder of masks of the calibration; those for all frames are copied.
-
-    Raises:
-        StorageError: it cannot be written, here or later.
-    """
+    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part. Of ``masks``,
+    the folder of masks of the calibration, those for all frames are copied. Raises StorageError if it cannot be
+    written, here or later."""
 
     def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, masks: Path) -> None:
         self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
