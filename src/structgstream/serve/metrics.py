@@ -43,19 +43,12 @@ class Viewers:
 
 
 class Metrics:
-    """Counters of one server.
-
-    Attributes:
-        requests: number of responses by stream, kind and status.
-        sent_bytes: bytes of response bodies by stream.
-        in_progress: number of requests that are being answered.
-        viewers: present viewers of each stream.
-    """
+    """Counters of one server."""
 
     def __init__(self) -> None:
-        self.requests: Counter[tuple[str, str, int]] = Counter()
-        self.sent_bytes: Counter[str] = Counter()
-        self.in_progress = 0
+        self.requests: Counter[tuple[str, str, int]] = Counter()  # responses by stream, kind and status
+        self.sent_bytes: Counter[str] = Counter()  # of response bodies, by stream
+        self.in_progress = 0  # requests that are being answered
         self.viewers = Viewers()
 
     def families(self) -> list[Metric]:

@@ -9,7 +9,7 @@ to read it; and URLs name cameras and frames, never files.
 """
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 from starlette.applications import Starlette
@@ -114,11 +114,8 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
             return PlainTextResponse("There is no such camera or frame.", 404, headers)
         return Response(data, media_type="image/jpeg", headers=headers)
 
-    def no_stream(request: Request, error: Exception) -> Response:
-        return PlainTextResponse(str(error), 404, headers)
-
-    def no_picture(request: Request, error: Exception) -> Response:
-        return PlainTextResponse(str(error), 500, headers)
+    def refusing(status: int) -> Callable[[Request, Exception], Response]:
+        return lambda request, error: PlainTextResponse(str(error), status, headers)
 
     return Starlette(
         routes=[
@@ -130,5 +127,5 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
             Route("/truth/{camera:path}/{frame:int}.jpg", picture),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(LOOPBACK_NAMES), www_redirect=False)],
-        exception_handlers={StreamError: no_stream, CaptureError: no_picture},
+        exception_handlers={StreamError: refusing(404), CaptureError: refusing(500)},
     )

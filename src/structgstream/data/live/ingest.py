@@ -150,15 +150,11 @@ class Ingest:
             self._failure = error
 
     def _warn_out_of_step(self, cameras: Mapping[str, float]) -> None:
+        late = "either they come late, which a longer deadline_seconds or a less busy machine mends, or its clock is"
         for name, seconds in cameras.items():
-            if seconds < 0:
-                why = (
-                    f"are {-seconds:.3f} s behind those of the others: either they come late, which a longer "
-                    "deadline_seconds or a less busy machine mends, or its clock is"
-                )
-            else:
-                why = f"are {seconds:.3f} s ahead of those of the others: its clock is"
+            side, cause = ("behind", late) if seconds < 0 else ("ahead of", "its clock is")
             text = (
-                f"is absent, because its pictures {why}, which offset_seconds = {-seconds:+.3f} in the rig file mends"
+                f"is absent, because its pictures are {abs(seconds):.3f} s {side} those of the others: {cause}, which "
+                f"offset_seconds = {-seconds:+.3f} in the rig file mends"
             )
             self._faults.warn(name, Fault.UNMATCHED.value, text)
