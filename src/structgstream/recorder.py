@@ -226,11 +226,7 @@ class SoundSink(_ForwardingSink):
     """Forwards a stream to ``sink``, with the sound of each frame.
 
     A frame has the packets that begin before it ends, so that a player that has a frame can play on until the next.
-
-    Args:
-        sound: of the run.
-        fps: frames a second.
-        after: presentation time of the last frame that is there already; None for a new stream.
+    ``after`` is the presentation time of the last frame that is there already; None for a new stream.
     """
 
     def __init__(self, sink: PacketSink, sound: SoundSource, *, fps: float, after: float | None) -> None:

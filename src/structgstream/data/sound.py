@@ -105,11 +105,8 @@ class SoundEncoder:
         self._codec: Any = codec
 
     def add(self, frame: "AudioFrame", seconds: float | None) -> list[OpusPacket]:
-        """The packets that are complete with another frame.
-
-        Args:
-            seconds: presentation time of its first sample; None where it follows the one before.
-        """
+        """The packets that are complete with another frame, whose first sample sounds at ``seconds`` of presentation
+        time; None where it follows the one before."""
         kind = frame.sample_rate, frame.layout.name, frame.format.name
         packets: list[OpusPacket] = []
         if kind != self._of:

@@ -95,10 +95,8 @@ class LiveOptions:
 
 
 class LiveSource:
-    """Frames of live cameras (docs/live.md). Cameras are opened when the first live frame is asked for.
-
-    Args:
-        stream: the stream to write, next to which the resume cache lies (:class:`ResumeCache`).
+    """Frames of live cameras (docs/live.md). Cameras are opened when the first live frame is asked for. The resume
+    cache (:class:`ResumeCache`) lies next to ``stream``, the stream to write.
 
     Raises:
         CaptureError: the rig file or the calibration is broken; while reading, a frame of the past is not cached.
