@@ -131,11 +131,8 @@ def segments_at(
 
 def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
     """Creates and checks the folder of a segmented stream; called before the fit of frame 0, which takes minutes.
-
-    Raises:
-        StorageError: it contains a stream or another program's manifest.json, cannot be created or written, or another
-            process writes to it.
-    """
+    Raises StorageError if it contains a stream or another program's manifest.json, cannot be created or written, or
+    another process writes to it."""
     store = FolderStore(path)
     there = store.names() if path.is_dir() else frozenset()
     if MANIFEST in there and not may_exist:
@@ -182,7 +179,26 @@ PREVIEW: Final = "preview.png"
 PREVIEW_WIDTH: Final = 320
 
 
-class PreviewSink:
+class _ForwardingSink:
+    """Forwards a stream to ``sink``; a header as :meth:`_header` changes it."""
+
+    def __init__(self, sink: PacketSink) -> None:
+        self._sink = sink
+
+    def open(self, header: StreamHeader) -> int:
+        return self._sink.open(self._header(header))
+
+    def begin(self, header: StreamHeader) -> int:
+        return self._sink.begin(self._header(header))
+
+    def close(self) -> None:
+        self._sink.close()
+
+    def _header(self, header: StreamHeader) -> StreamHeader:
+        raise NotImplementedError
+
+
+class PreviewSink(_ForwardingSink):
     """Forwards a stream to ``sink``, and writes ``preview.png`` of each key frame to the same store.
 
     The picture is rendered on the CPU from the decoded packet, so that the run's GPU memory and random numbers do not
@@ -190,54 +206,37 @@ class PreviewSink:
     """
 
     def __init__(self, sink: PacketSink, store: Store) -> None:
-        self._sink = sink
+        super().__init__(sink)
         self._store = store
-        self._header: StreamHeader | None = None
-
-    def open(self, header: StreamHeader) -> int:
-        self._header = header
-        return self._sink.open(header)
-
-    def begin(self, header: StreamHeader) -> int:
-        self._header = header
-        return self._sink.begin(header)
+        self._newest: StreamHeader | None = None
 
     def write(self, packet: Packet) -> int:
         size = self._sink.write(packet)
-        if packet.kind is PacketKind.KEY and self._header is not None:
+        if packet.kind is PacketKind.KEY and self._newest is not None:
             with suppress(StorageError):
-                self._store.put(PREVIEW, png_bytes(preview(self._header, packet)))
+                self._store.put(PREVIEW, png_bytes(preview(self._newest, packet)))
         return size
 
-    def close(self) -> None:
-        self._sink.close()
+    def _header(self, header: StreamHeader) -> StreamHeader:
+        self._newest = header
+        return header
 
 
-class SoundSink:
+class SoundSink(_ForwardingSink):
     """Forwards a stream to ``sink``, with the sound of each frame.
 
     A frame has the packets that begin before it ends, so that a player that has a frame can play on until the next.
-
-    Args:
-        sound: of the run.
-        fps: frames a second.
-        after: presentation time of the last frame that is there already; None for a new stream.
+    ``after`` is the presentation time of the last frame that is there already; None for a new stream.
     """
 
     def __init__(self, sink: PacketSink, sound: SoundSource, *, fps: float, after: float | None) -> None:
-        self._sink = sink
+        super().__init__(sink)
         self._feed = sound.open()
         self._frame_seconds = 1.0 / fps
         self._from = -math.inf
         if after is not None:
             self._from = after + self._frame_seconds
             self._feed.until(self._from)
-
-    def open(self, header: StreamHeader) -> int:
-        return self._sink.open(self._stated(header))
-
-    def begin(self, header: StreamHeader) -> int:
-        return self._sink.begin(self._stated(header))
 
     def write(self, packet: Packet) -> int:
         # A live camera is heard before its first frame, which may follow the last one that is there.
@@ -246,10 +245,7 @@ class SoundSink:
         sound = frame_sound(packet.index, packet.pts_seconds, heard)
         return self._sink.write(replace(packet, sound=sound.pack()))
 
-    def close(self) -> None:
-        self._sink.close()
-
-    def _stated(self, header: StreamHeader) -> StreamHeader:
+    def _header(self, header: StreamHeader) -> StreamHeader:
         return replace(header, sound=SoundFormat(self._feed.channels))
 
 
@@ -261,11 +257,8 @@ def with_sound(
     source: FrameStream,
     resumed: StoredStream[State] | None,
 ) -> tuple[SoundSink, Mapping[str, object]]:
-    """The sink of a run with sound, and its metadata, by which a stream is resumed with the same sound alone.
-
-    Raises:
-        CaptureError: the sound cannot be read.
-    """
+    """The sink of a run with sound, and its metadata, by which a stream is resumed with the same sound alone. Raises
+    CaptureError if the sound cannot be read."""
     after = resumed.packets[-1].pts_seconds if resumed is not None and len(resumed) else None
     return SoundSink(sink, sound, fps=source.fps, after=after), {**(metadata or {}), "sound": sound.name}
 
@@ -273,8 +266,7 @@ def with_sound(
 def copy_with_sound(reader: StreamReader, sink: PacketSink, sound: SoundSource, *, name: str) -> None:
     """Writes the frames of a stream without sound to ``sink``, with sound.
 
-    Args:
-        name: of the stream, for messages.
+    ``name`` is that of the stream, for messages.
 
     Raises:
         StreamError: the stream has sound, or a frame is lost.
@@ -343,14 +335,15 @@ class Figures:
     def values(self) -> dict[str, Any]:
         """Sizes, times and numbers of Gaussians, as plain JSON values; None if unknown."""
         last = self._recent[-1] if self._recent else None
+        psnr = getattr(last, "train_psnr", math.nan)
         return {
-            "pts_seconds": None if last is None else last.pts_seconds,
+            "pts_seconds": getattr(last, "pts_seconds", None),
             "bytes": self._bytes,
-            "bits_per_second": _bit_rate([*self._recent], self._fps),
+            "bits_per_second": _bit_rate(self._recent, self._fps),
             "seconds_by_stage": _mean([report.seconds for report in self._recent]),
-            "train_psnr": None if last is None or not math.isfinite(last.train_psnr) else last.train_psnr,
-            "anchors": None if last is None else last.anchors,
-            "free": None if last is None else last.free,
+            "train_psnr": psnr if math.isfinite(psnr) else None,
+            "anchors": getattr(last, "anchors", None),
+            "free": getattr(last, "free", None),
         }
 
 
@@ -400,8 +393,8 @@ class RunMetrics:
         self.write()
         if self._live is None:
             return {}
-        taken = self.values()
-        return {"run": {key: taken[key] for key in LOGGED}}
+        values = self.values()
+        return {"run": {key: values[key] for key in LOGGED}}
 
     def values(self) -> dict[str, Any]:
         """All metrics, as plain JSON values."""
@@ -410,11 +403,9 @@ class RunMetrics:
             now, figures = self._now(), self._figures.values()
             if live is not None:
                 self._arrived.append((now, live.sets))
-            several: dict[str, Any] = {}
-            if self._qualities:  # Numbers of Gaussians and PSNR belong to a single quality.
+            several = {name: {"frames": own.frames, **own.values()} for name, own in self._qualities.items()}
+            if several:  # Numbers of Gaussians and PSNR belong to a single quality.
                 figures |= {"train_psnr": None, "anchors": None, "free": None}
-                each = {name: {"frames": own.frames, **own.values()} for name, own in self._qualities.items()}
-                several["qualities"] = each
             return {
                 "format": "structgstream-metrics",
                 "version": 1,
@@ -426,15 +417,15 @@ class RunMetrics:
                 "frames": self._done,
                 "frames_total": self._total,
                 "fps": self._fps,
-                "frames_in_per_second": None if live is None else _rate([*self._arrived]),
-                "frames_out_per_second": _rate([*self._stored]),
+                "frames_in_per_second": None if live is None else _rate(self._arrived),
+                "frames_out_per_second": _rate(self._stored),
                 "stored_after_seconds": self._age,
                 **figures,
                 "absent": self._absent,
                 "disk_free_bytes": free_bytes(self._stream),
                 "resident_bytes": resident_bytes(),
                 "live": None if live is None else asdict(live),
-                **several,
+                **({"qualities": several} if several else {}),
             }
 
     def write(self) -> None:
@@ -469,14 +460,14 @@ class RunMetrics:
             self.write()
 
 
-def _rate(counted: list[tuple[float, int]]) -> float | None:
+def _rate(counted: Sequence[tuple[float, int]]) -> float | None:
     """Increase of a counter per second."""
     if len(counted) < 2 or counted[-1][0] <= counted[0][0]:
         return None
     return (counted[-1][1] - counted[0][1]) / (counted[-1][0] - counted[0][0])
 
 
-def _bit_rate(reports: list[FrameReport], fps: float) -> float | None:
+def _bit_rate(reports: Sequence[FrameReport], fps: float) -> float | None:
     """Bits per second of media time, including the time of skipped frames."""
     if not reports:
         return None

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sound in presentation time: clocks, rates, channels, gaps, and what is missing. A clap is off by 1 ms at most."""
+"""Sound in presentation time: clocks, rates, channels, gaps, and what is missing; a clap is off by 1 ms at most. And as
+samples, on the clock of a video's pictures."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,12 +8,13 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.sound import unpack_sound
-from structgstream.data.live.sound import LiveSound
+from structgstream.data import sound as audio
 from structgstream.data.open import open_capture
-from structgstream.data.sound import SoundEncoder, SoundFile, camera_clock, start_seconds
+from structgstream.data.sound import LiveSound, SoundEncoder, SoundFile, camera_clock, read_audio, start_seconds
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.opus import PACKET_SECONDS, OpusPacket
@@ -22,6 +24,12 @@ from tests.support.quick_streams import CLIP
 from tests.support.sounds import add_sound, claps, packets_heard, write_sound
 
 MILLISECOND = 1e-3
+
+
+def sound_frame(samples: NDArray[np.float32]) -> av.AudioFrame:
+    frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
+    frame.sample_rate = 48_000
+    return frame
 
 
 def heard(path: Path, clock: Clock, seconds: float) -> tuple[list[OpusPacket], list[float]]:
@@ -34,9 +42,8 @@ def heard(path: Path, clock: Clock, seconds: float) -> tuple[list[OpusPacket], l
 @pytest.mark.parametrize("channels", [1, 2, 6])
 def test_any_rate_and_number_of_channels(tmp_path: Path, rate: int, channels: int) -> None:
     path = write_sound(tmp_path / "a.wav", claps(2.0, 0.5, 1.25, rate=rate, channels=channels), rate=rate)
-    feed = SoundFile("it", path, Clock()).open()
-    assert feed.channels == min(channels, 2)
-    found = packets_heard(feed.until(2.0), channels=feed.channels)
+    assert SoundFile("it", path, Clock()).open().channels == min(channels, 2)
+    _, found = heard(path, Clock(), 2.0)
     assert found == pytest.approx([0.5, 1.25], abs=MILLISECOND)
 
 
@@ -68,11 +75,8 @@ def test_packets_do_not_depend_on_how_they_are_asked_for(tmp_path: Path) -> None
 
 def test_a_gap_in_the_time_stamps_is_silence_and_what_comes_twice_is_left_out() -> None:
     encoder, packets = SoundEncoder(1), list[OpusPacket]()
-    samples = claps(0.1, 0.05)
     for seconds in (0.0, 0.5, 0.55, 1.0):
-        frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
-        frame.sample_rate = 48_000
-        packets += encoder.add(frame, seconds)
+        packets += encoder.add(sound_frame(claps(0.1, 0.05)), seconds)
     packets += encoder.finish()
     # The third begins with what the second ends with.
     assert packets_heard(packets) == pytest.approx([0.05, 0.55, 1.05], abs=MILLISECOND)
@@ -131,9 +135,7 @@ def test_a_live_stream_that_is_resumed_hears_nothing_twice() -> None:
     written: list[Packet] = []
     live = LiveSound("cam")
     sink = SoundSink(SimpleNamespace(write=written.append), live, fps=25.0, after=2.0)  # pyright: ignore[reportArgumentType]
-    frame = av.AudioFrame.from_ndarray(claps(1.0), format="fltp", layout="mono")
-    frame.sample_rate = 48_000
-    live.add(frame, 101.54)
+    live.add(sound_frame(claps(1.0)), 101.54)
     live.synchronize(100.0)
     sink.write(Packet(PacketKind.KEY, 51, 2.04, b"", {}))
     assert written[0].sound is not None
@@ -148,10 +150,7 @@ def test_live_sound_is_in_step_with_the_pictures_and_begins_again_after_an_outag
     feeds = [sound.open(), sound.open()]
 
     def send(first: float, seconds: float) -> None:
-        samples = claps(seconds, seconds / 2)
-        frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
-        frame.sample_rate = 48_000
-        sound.add(frame, first)
+        sound.add(sound_frame(claps(seconds, seconds / 2)), first)
 
     send(99.0, 0.5)  # before the first picture
     send(99.9, 0.4)
@@ -167,3 +166,71 @@ def test_live_sound_is_in_step_with_the_pictures_and_begins_again_after_an_outag
     gap = [one.seconds for one in after if one.seconds > 90.0]
     assert gap[0] == pytest.approx(100.0, abs=0.03)
     assert packets_heard([one for one in after if one.seconds > 90.0]) == pytest.approx([100.5], abs=MILLISECOND)
+
+
+RATE = 48_000
+
+
+def with_sound(path: Path, *, start: float = 0.0, rate: int = RATE, channels: int = 1) -> Path:
+    """A video whose sound, a second with a click in its middle, begins at ``start`` seconds."""
+    samples = np.zeros((channels, rate), np.float32)
+    samples[:, rate // 2] = 0.9
+    write_video(path.with_suffix(".mp4"), [np.zeros((48, 64, 3), np.uint8)] * 5)
+    codec = "aac" if path.suffix == ".ts" else "pcm_f32le"
+    return add_sound(path.with_suffix(".mp4"), path, samples, rate=rate, start=start, codec=codec)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.25])
+def test_sample_k_sounds_at_k_over_the_rate(tmp_path: Path, start: float) -> None:
+    samples = read_audio(with_sound(tmp_path / "a.mkv", start=start))
+    assert samples is not None
+    assert samples.dtype == np.float32
+    assert int(np.abs(samples).argmax()) == pytest.approx((start + 0.5) * RATE, abs=60)  # Matroska keeps milliseconds
+    assert len(samples) == pytest.approx((start + 1.0) * RATE, abs=60)
+    assert not samples[: round(start * RATE) - 60 if start else 0].any()
+
+
+def test_gaps_in_the_time_stamps_are_silence_and_what_comes_twice_is_left_out(tmp_path: Path) -> None:
+    """Recorders of streams lose packets, and send some again."""
+    block = RATE // 10
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        sound = container.add_stream("pcm_f32le", rate=RATE)
+        sound.layout = "mono"
+        for number in (0, 1, 5, 5, 6):  # tenths of a second
+            frame = av.AudioFrame.from_ndarray(np.full((1, block), 0.1 * number, np.float32), "flt", "mono")
+            frame.sample_rate, frame.pts = RATE, number * block
+            container.mux(sound.encode(frame))
+    samples = read_audio(tmp_path / "a.mkv")
+    assert samples is not None
+    np.testing.assert_allclose(samples.reshape(7, block)[:, block // 2], [0, 0.1, 0, 0, 0, 0.5, 0.6], atol=1e-6)
+
+
+def test_another_rate_is_converted(tmp_path: Path) -> None:
+    samples = read_audio(with_sound(tmp_path / "a.mkv", rate=16_000))
+    assert samples is not None
+    assert int(np.abs(samples).argmax()) == pytest.approx(0.5 * RATE, abs=60)
+
+
+def test_a_video_without_sound(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    assert read_audio(tmp_path / "a.mp4") is None
+
+
+def test_a_very_long_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audio, "LONGEST_SECONDS", 0.9)
+    with pytest.raises(CaptureError, match=r"a\.mkv is longer than two hours; cut it to the take"):
+        read_audio(with_sound(tmp_path / "a.mkv"))
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_text("no video")
+    with pytest.raises(CaptureError, match=r"sound of .*a\.mp4 cannot be read"):
+        read_audio(tmp_path / "a.mp4")
+
+
+def test_sound_whose_channels_change(tmp_path: Path) -> None:
+    """As recordings of broadcasts have it."""
+    parts = [with_sound(tmp_path / f"{channels}.ts", channels=channels).read_bytes() for channels in (1, 2)]
+    (tmp_path / "a.ts").write_bytes(b"".join(parts))
+    with pytest.raises(CaptureError, match=r"sound of .*a\.ts cannot be decoded \(Frame does not match"):
+        read_audio(tmp_path / "a.ts")

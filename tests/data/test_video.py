@@ -1,27 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-import logging
+"""Videos as a capture, matched by time stamp, and their pictures, also where a file is damaged."""
+
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
 
 from structgstream.data.timeline import Clock
-from structgstream.data.video import VideoSource, measured_fps, synchronised
+from structgstream.data.video import VideoSource, measured_fps, pictures_at, synchronised
 from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
-from tests.support.captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
+from tests.support.captures import (
+    FULL,
+    HEIGHT,
+    LIMITED,
+    WIDTH,
+    Picture,
+    all_numbers,
+    numbers,
+    picture,
+    small_rig,
+    write_video,
+    write_videos,
+)
 
 RIG = small_rig(3)
 
 
-def read(folder: Path, fps: float | None = None) -> VideoSource:
-    return synchronised(scan_videos({name: folder / f"{name}.mp4" for name in RIG}), RIG, where=folder, fps=fps)
-
-
-def scan_tracks(folder: Path) -> dict[str, VideoTrack]:
-    return scan_videos({name: folder / f"{name}.mp4" for name in RIG})
+def read(folder: Path, *, suffix: str = "mp4", **options: Any) -> VideoSource:
+    tracks = scan_videos({name: folder / f"{name}.{suffix}" for name in RIG})
+    return synchronised(tracks, RIG, where=folder, **options)
 
 
 def rewrite(folder: Path, name: str, frames: list[int], instants: list[float] | None = None, fps: float = 30) -> None:
@@ -52,8 +64,7 @@ def test_seeking_is_exact_for_every_start(tmp_path: Path, suffix: str, options: 
     for camera, name in enumerate(RIG):
         images = [picture(camera, frame) for frame in range(12)]
         write_video(tmp_path / f"{name}.{suffix}", images, options=options)
-    tracks = scan_videos({name: tmp_path / f"{name}.{suffix}" for name in RIG})
-    source = synchronised(tracks, RIG, where=tmp_path)
+    source = read(tmp_path, suffix=suffix)
     for start in range(12):
         assert all_numbers(source.frames(start)) == [[(n, frame) for n in range(3)] for frame in range(start, 12)]
     assert list(source.frames(12)) == []
@@ -62,8 +73,7 @@ def test_seeking_is_exact_for_every_start(tmp_path: Path, suffix: str, options: 
 def test_cameras_are_matched_by_time_not_by_count(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_videos(tmp_path, list(RIG), frames=8)
     rewrite(tmp_path, "cam01", [2, 3, 4, 5, 6, 7, 8])
-    with caplog.at_level(logging.WARNING):
-        source = read(tmp_path)
+    source = read(tmp_path)
     assert "'cam01' starts with the instant 0.067 s; 2 earlier" in caplog.text
     assert [[frame for _, frame in row] for row in all_numbers(source.frames())] == [[n] * 3 for n in range(2, 8)]
 
@@ -90,7 +100,7 @@ def test_a_duplicate_frame_names_camera_and_time(tmp_path: Path) -> None:
 def test_a_duplicate_frame_with_clocks_leaves_the_nearer(tmp_path: Path) -> None:
     write_videos(tmp_path, list(RIG), frames=6)
     rewrite(tmp_path, "cam01", [0, 1, 2, 9, 3, 4, 5], [0, 1, 2, 2.25, 3, 4, 5])
-    source = synchronised(scan_tracks(tmp_path), RIG, where=tmp_path, clocks={})
+    source = read(tmp_path, clocks={})
     assert [numbers(frame.images["cam01"])[1] for frame in source.frames()] == list(range(6))
 
 
@@ -127,7 +137,7 @@ def test_clocks_move_and_stretch_the_time_stamps(tmp_path: Path) -> None:
     write_videos(tmp_path, list(RIG), frames=20)
     rewrite(tmp_path, "cam01", list(range(20)), [(n + 4.3) / 1.002 for n in range(20)])
     clocks = {"cam00": Clock(), "cam01": Clock(-7.3 / 30, 1.002), "cam02": Clock(0.004)}
-    source = synchronised(scan_tracks(tmp_path), RIG, where=tmp_path, clocks=clocks)
+    source = read(tmp_path, clocks=clocks)
     assert len(source) == 17
     assert source.apart_seconds["cam02"] - source.apart_seconds["cam00"] == pytest.approx(0.004, abs=1e-4)
     seen = [[numbers(image)[1] for image in frame.images.values()] for frame in source.frames()]
@@ -136,7 +146,7 @@ def test_clocks_move_and_stretch_the_time_stamps(tmp_path: Path) -> None:
 
 def test_the_rate_that_is_asked_for_thins_out(tmp_path: Path) -> None:
     write_videos(tmp_path, list(RIG), frames=9)
-    source = synchronised(scan_tracks(tmp_path), RIG, where=tmp_path, fps=15, clocks={})
+    source = read(tmp_path, fps=15, clocks={})
     assert [row[0][1] for row in all_numbers(source.frames())] == [0, 2, 4, 6, 8]
 
 
@@ -203,22 +213,29 @@ def test_a_truncated_video_is_found_at_once(tmp_path: Path, kept: float) -> None
         read(tmp_path)
 
 
+def noise(frames: int) -> list[Picture]:
+    """Pictures of large files, so that damage hits data."""
+    return [*np.random.default_rng(3).integers(0, 255, (frames, HEIGHT, WIDTH, 3), dtype=np.uint8)]
+
+
+def damage(path: Path, share: float) -> None:
+    """Zeros in place of what follows ``share`` of a file."""
+    data = bytearray(path.read_bytes())
+    middle = int(len(data) * share)
+    for at in range(middle, min(middle + 4000, len(data))):
+        if path.suffix != ".ts" or at % 188 >= 20:  # headers of transport packets stay
+            data[at] = 0
+    path.write_bytes(data)
+
+
 def damaged(
     folder: Path, *, suffix: str = "mp4", share: float = 0.6, options: dict[str, str] | None = None
 ) -> VideoSource:
-    """Videos of noise, large, so that damage hits data; that of ``cam01`` is broken from ``share`` of it on."""
-    rng = np.random.default_rng(3)
-    noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(24)]
+    """Videos of noise; that of ``cam01`` is broken from ``share`` of it on."""
     for name in RIG:
-        write_video(folder / f"{name}.{suffix}", noise, options=options)
-    data = bytearray((folder / f"cam01.{suffix}").read_bytes())
-    middle = int(len(data) * share)
-    for at in range(middle, middle + 4000):
-        if suffix != "ts" or at % 188 >= 20:  # headers of transport packets stay
-            data[at] = 0
-    (folder / f"cam01.{suffix}").write_bytes(data)
-    tracks = scan_videos({name: folder / f"{name}.{suffix}" for name in RIG})
-    return synchronised(tracks, RIG, where=folder)
+        write_video(folder / f"{name}.{suffix}", noise(24), options=options)
+    damage(folder / f"cam01.{suffix}", share)
+    return read(folder, suffix=suffix)
 
 
 def test_a_damage_makes_its_camera_absent_up_to_the_next_key_frame(
@@ -319,3 +336,54 @@ def test_the_extra_is_named_when_the_reader_is_absent(tmp_path: Path, monkeypatc
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
         scan_videos({"a": tmp_path / "a.mp4"})
+
+
+def track_of(folder: Path, pictures: list[Picture]) -> VideoTrack:
+    write_video(folder / "a.mp4", pictures)
+    return scan_videos({"a": folder / "a.mp4"})["a"]
+
+
+@pytest.fixture
+def track(tmp_path: Path) -> VideoTrack:
+    """Numbered pictures with B-frames, in groups of four."""
+    return track_of(tmp_path, [picture(3, number) for number in range(16)])
+
+
+def read_at(track: VideoTrack, stamps: list[int | None]) -> tuple[list, list[tuple[int, int | None, str]]]:
+    """Pictures at time stamps, and what is reported as damage."""
+    damages: list[tuple[int, int | None, str]] = []
+    shown = pictures_at(track, stamps, size=(WIDTH, HEIGHT), on_damage=lambda *reported: damages.append(reported))
+    return [None if one is None else one[0] for one in shown], damages
+
+
+def test_any_ascending_choice_of_frames_is_exact(track: VideoTrack) -> None:
+    for chosen in ([0, 1, 2], [5], [2, 7, 15], [11, 12]):
+        found, damages = read_at(track, [track.stamps[number] for number in chosen])
+        assert [numbers(image) for image in found] == [(3, number) for number in chosen]
+        assert damages == []
+
+
+def test_where_nothing_is_wanted_there_is_no_picture(track: VideoTrack) -> None:
+    found, _ = read_at(track, [None, track.stamps[4], None, track.stamps[6], None])
+    assert [image is None for image in found] == [True, False, True, False, True]
+    assert [numbers(image) for image in found if image is not None] == [(3, 4), (3, 6)]
+    gone = replace(track, path=track.path.with_name("gone.mp4"))
+    assert read_at(gone, [None, None]) == ([None, None], [])  # not even opened
+
+
+def test_a_video_whose_size_changes_is_refused_where_it_does(track: VideoTrack) -> None:
+    larger = replace(track, width=2 * WIDTH, height=2 * HEIGHT)  # As its first frames may have had.
+    with pytest.raises(CaptureError, match=r"changes its size from 128x96 to 64x48 at 0\.3"):
+        read_at(larger, [track.stamps[9]])
+
+
+@pytest.mark.parametrize("share", [0.6, 0.97])
+def test_damage_is_reported_with_what_is_lost_up_to_the_next_key_frame(tmp_path: Path, share: float) -> None:
+    track = track_of(tmp_path, noise(16))
+    damage(track.path, share)
+    found, ((lost, following, reason),) = read_at(track, list(track.stamps))
+    end = len(track.stamps) if following is None else track.stamps.index(following)
+    assert [number for number, image in enumerate(found) if image is None] == list(range(track.stamps.index(lost), end))
+    assert (following is None) == (share == 0.97)
+    assert following is None or following in track.keyframes
+    assert reason

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What phones and camcorders write: turned, mirrored, 10 bit, interlaced, and coded in unknown ways."""
 
+import re
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -74,26 +75,32 @@ def test_turned_videos_are_read_as_they_are_shown(tmp_path: Path, turn: int, qua
     np.testing.assert_allclose(smaller, expected[::2, ::2], atol=4)
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(CaptureError) as caught:
-        scan_videos({"a": path})
-    return str(caught.value)
-
-
-def test_other_turns_and_mirrors_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a.mp4", [corners()] * 5, turn=30)
-    assert "a.mp4 say that it is turned by an angle that is not a quarter turn; convert it" in refusal(
-        tmp_path / "a.mp4"
-    )
-    write(tmp_path / "b.mp4", [corners()] * 5, turn=0, mirrored=True)
-    assert "b.mp4 say that it is mirrored" in refusal(tmp_path / "b.mp4")
-
-
-def test_interlaced_videos_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a.mp4", [corners()] * 5, pixels="yuv420p", interlaced=True, options={"x264-params": "tff=1"})
-    assert "a.mp4 is interlaced: its lines are of two instants; set the camera to a progressive" in refusal(
-        tmp_path / "a.mp4"
-    )
+@pytest.mark.parametrize(
+    ("said", "written"),
+    [
+        ("say that it is turned by an angle that is not a quarter turn; convert it", {"turn": 30}),
+        ("say that it is mirrored", {"turn": 0, "mirrored": True}),
+        (
+            "is interlaced: its lines are of two instants; set the camera to a progressive",
+            {"pixels": "yuv420p", "interlaced": True, "options": {"x264-params": "tff=1"}},
+        ),
+        (  # Screen recorders write it; read as BT.709 it is green and violet.
+            "states a colour matrix (YCgCo) that is not read; expected RGB, BT.601",
+            {"options": {"x264-params": "colormatrix=YCgCo"}},
+        ),
+        *(  # Log videos state no transfer function; others would be shown pale.
+            (
+                "has the primaries of BT.2020 and does not state HLG or PQ",
+                {"options": {"x264-params": f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc"}},
+            )
+            for transfer in ("undef", "bt2020-10")
+        ),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, said: str, written: dict[str, Any]) -> None:
+    write(tmp_path / "a.mp4", [corners()] * 5, **written)
+    with pytest.raises(CaptureError, match=re.escape(f"a.mp4 {said}")):
+        scan_videos({"a": tmp_path / "a.mp4"})
 
 
 def test_the_shape_of_pixels_is_read(tmp_path: Path) -> None:
@@ -101,21 +108,6 @@ def test_the_shape_of_pixels_is_read(tmp_path: Path) -> None:
         write(tmp_path / f"{name}.mp4", [corners()] * 2, aspect=aspect)
         expected = pytest.approx(float(aspect or 1))
         assert scan_videos({"a": tmp_path / f"{name}.mp4"})["a"].pixel_aspect == expected
-
-
-def test_a_matrix_that_is_not_converted_is_refused(tmp_path: Path) -> None:
-    """Screen recorders write YCgCo; read as BT.709 it is green and violet."""
-    options = {"x264-params": "colormatrix=YCgCo"}
-    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
-    assert "a.mp4 states a colour matrix (YCgCo) that is not read; expected RGB, BT.601" in refusal(tmp_path / "a.mp4")
-
-
-@pytest.mark.parametrize("transfer", ["undef", "bt2020-10"])
-def test_wide_primaries_in_standard_range_are_refused(tmp_path: Path, transfer: str) -> None:
-    """Log videos state no transfer function; others would be shown pale."""
-    options = {"x264-params": f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc"}
-    write(tmp_path / "a.mp4", [corners()] * 2, options=options)
-    assert "a.mp4 has the primaries of BT.2020 and does not state HLG or PQ" in refusal(tmp_path / "a.mp4")
 
 
 def test_ten_bit_hevc_is_read(tmp_path: Path) -> None:
@@ -146,6 +138,5 @@ def test_an_unknown_codec_is_named_in_one_sentence(tmp_path: Path) -> None:
     write_videos(tmp_path, ["a"], frames=3)
     data = (tmp_path / "a.mp4").read_bytes()
     (tmp_path / "a.mp4").write_bytes(data.replace(b"avc1", b"zzzz"))
-    assert "a.mp4 is coded in a way that the installed PyAV cannot decode; convert it to H.264" in refusal(
-        tmp_path / "a.mp4"
-    )
+    with pytest.raises(CaptureError, match=r"a\.mp4 is coded in a way that the installed PyAV cannot decode"):
+        scan_videos({"a": tmp_path / "a.mp4"})

@@ -12,7 +12,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -28,6 +28,7 @@ from structgstream.serve.listening import LOOPBACK_NAMES
 from tests.support.segment_folders import GrowingFolder
 from tests.support.serving import Served, hosted
 from tests.support.streams import small_stream
+from tests.support.waiting import wait_until
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 NAME = "live.example.org"
@@ -46,16 +47,16 @@ def started(command: list[str], port: int, folder: Path, **environment: str) -> 
     """A proxy in a process of its own, which listens on a port of the loopback address."""
     with (folder / "stderr").open("wb") as stderr:
         process = subprocess.Popen(command, env={**os.environ, **environment}, stderr=stderr)
+
+    def is_up() -> bool:
+        assert process.poll() is None, command
+        with suppress(OSError):
+            socket.create_connection(("127.0.0.1", port), 1).close()
+            return True
+        return False
+
     try:
-        last = time.monotonic() + PATIENCE_SECONDS
-        while True:
-            assert process.poll() is None, command
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except OSError:
-                assert time.monotonic() < last
-                time.sleep(0.1)
+        wait_until(is_up, seconds=PATIENCE_SECONDS)
         yield Served(port)
     finally:
         process.terminate()
@@ -153,10 +154,7 @@ def test_a_live_stream_behind_a_proxy(tmp_path: Path, proxy: str) -> None:
             assert ask(address).headers["x-cache"] == "HIT"
         # So it is with the files of a quality.
         part = f"/streams/show/low/{low.write().parts[0].file}"
-        last = time.monotonic() + PATIENCE_SECONDS
-        while ask(part).status == 404:
-            assert time.monotonic() < last
-            time.sleep(0.1)
+        wait_until(lambda: ask(part).status != 404, seconds=PATIENCE_SECONDS)
         if proxy == "nginx":
             assert ask(part).headers["x-cache"] == "HIT"
         # Waiting goes through the proxy.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this package makes of the player, in a real browser: the page, the served page, the site, the widget.
+"""What this package makes of the player, in a real browser: the page, the served pages, the site, the widget.
 
 The player itself is tested in ``viewer/packages``.
 """
@@ -7,6 +7,7 @@ The player itself is tested in ``viewer/packages``.
 import base64
 import getpass
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -24,22 +25,27 @@ import pytest
 from numpy.typing import NDArray
 
 from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.sinks import FileSink, resume_segments
+from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
+from structgstream.evaluation.pictures import png_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.notebook import Player
 from structgstream.sequence_import import import_sequence
+from structgstream.serve.access import EVERY_STREAM, TokenKeys
+from structgstream.serve.app import ServerSettings
 from structgstream.serve.pages import StreamFile, bundle, linked_page, write_page, write_site
 from structgstream.serve.play import Truth
 from tests.support.chromium import Browser, Tab, opened_browser
 from tests.support.pictures import decoded_picture
 from tests.support.plain import some
 from tests.support.rigs import arc_rig, random_scene
-from tests.support.serving import served
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import hosted, served
 from tests.support.streams import compact_header, moved, write_stream
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -286,4 +292,93 @@ def test_the_widget_shows_a_stream_and_another_and_goes(tab: Tab, stream: Path, 
     tab.evaluate("values.height_pixels = 100, listeners.get('change:height_pixels')(), 1")
     assert tab.evaluate(f"{PLAYER}.getBoundingClientRect().height") == 100
     assert tab.evaluate(f"end(), {PLAYER} === null && listeners.size === 0")
+    assert not tab.complaints
+
+
+KEYS = TokenKeys((b"a secret of thirty-two characters",))
+
+
+def answered(metrics: str, kind: str, stream: str) -> bool:
+    """Whether the server has sent files of a kind."""
+    sample = rf'structgstream_requests_total{{kind="{kind}",status="20.",stream="{stream}"}}'
+    return re.search(sample, metrics) is not None
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    sink = MemorySink()
+    scenes = [moved(random_scene(60, seed=4), step) for step in range(6)]
+    write_stream(sink, scenes, header=compact_header(scenes[0]))
+    streams = tmp_path / "streams"
+    GrowingFolder(streams / "studio", sink.data).write()
+    (streams / "ball.sgs").write_bytes(sink.data)
+    for path in (streams / "studio" / "preview.png", streams / "ball.preview.png"):
+        path.write_bytes(png_bytes(np.full((6, 8, 3), 200, np.uint8)))
+    return streams
+
+
+def test_from_the_list_to_a_picture_with_one_token(tab: Tab, folder: Path) -> None:
+    token = KEYS.token(EVERY_STREAM, expires_unix_seconds=int(time.time()) + 600)
+    with hosted(ServerSettings(folder, keys=KEYS)) as server:
+        tab.open(f"{server.address}?token={token}", width=640, height=480)
+        pictures = "performance.getEntriesByType('resource').filter(one => one.responseStatus === 200).length"
+        tab.wait_for(f"{pictures} === 2")
+        assert not tab.complaints
+        # Later: a page that is left while it answers gives no answer.
+        tab.evaluate("setTimeout(() => document.querySelector('a[href*=\"ball.sgs\"]').click()), 1")
+        tab.wait_for(SHOWN)
+        asked = [address for address in tab.requests if address.startswith("http") and "player.js" not in address]
+        answers = server.ask("/metrics", Authorization=f"Bearer {token}").text
+    # The player's worker asks for the bytes; no request lacked the token.
+    assert answered(answers, "file", "ball.sgs")
+    assert 'status="401"' not in answers
+    assert all(f"token={token}" in address for address in asked)
+    assert all(address.startswith(server.address) for address in asked)
+    assert not tab.complaints
+
+
+def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: Path) -> None:
+    """By hand, in the panel, with a token of that stream alone; these two qualities show different scenes."""
+    folder = tmp_path / "streams"
+    for name, seed in (("low", 4), ("high", 9)):
+        sink = MemorySink()
+        scenes = [moved(random_scene(60, seed=seed), step) for step in range(6)]
+        write_stream(sink, scenes, header=compact_header(scenes[0]))
+        GrowingFolder(folder / "show" / name, sink.data).write_all()
+    listed = [ListedQuality(name, f"{name}/manifest.json", bits) for name, bits in (("low", 1e6), ("high", 1e12))]
+    write_list(folder / "show", listed)
+    panel = f"{PLAYER}.shadowRoot.querySelector('[aria-label^=Picture]')"
+    found = f"[...{PLAYER}.shadowRoot.querySelectorAll('select')].find((one) => one.innerText.includes('high'))"
+    soon = int(time.time()) + 600
+    token, all_streams = (KEYS.token(name, expires_unix_seconds=soon) for name in ("show", EVERY_STREAM))
+
+    def shown(frame: int) -> np.ndarray:
+        """What a frame looks like."""
+        hidden = f"{PLAYER}.setAttribute('controls', 'off')"
+        tab.evaluate(f"{PLAYER}.pause(), {hidden}, {PLAYER}.seek({frame + 0.5} / 30), 1")
+        tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {frame}")
+        return tab.screenshot().astype(float)
+
+    def numbers() -> str:
+        return server.ask("/metrics", Authorization=f"Bearer {all_streams}").text
+
+    with hosted(ServerSettings(folder, keys=KEYS)) as server:
+        tab.open(f"{server.address}streams/show/?token={token}", width=360, height=240)
+        tab.wait_for(SHOWN)
+        low = shown(2)
+        assert answered(numbers(), "segment", "show/low")
+        assert not answered(numbers(), "segment", "show/high"), "no connection has this bit rate"
+        tab.evaluate(f"{PLAYER}.removeAttribute('controls'), {panel}.click(), 1")
+        assert tab.wait_for(f"{found}?.innerText").split() == ["automatic", "low", "high"]
+        tab.evaluate(f"((one) => {{ one.value = '1'; one.dispatchEvent(new Event('change')); }})({found}), 1")
+        tab.evaluate(f"{panel}.click(), {PLAYER}.seek(0.01), {PLAYER}.play(), 1")
+        tab.wait_for(f"{PLAYER}.stats.frameIndex >= 4")
+        high, last = shown(2), time.monotonic() + 20
+        while np.array_equal(high, low) and time.monotonic() < last:  # A busy machine has not fetched it yet.
+            tab.evaluate(f"{PLAYER}.seek(0.01), 1")
+            high = shown(2)
+        reported = numbers()
+    assert answered(reported, "segment", "show/high")
+    assert 'status="401"' not in reported
+    assert np.abs(low - high).mean() > 5
     assert not tab.complaints

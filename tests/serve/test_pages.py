@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The player's module, the pages that contain it and their policy, and the list of streams."""
+"""The player's module, the pages that contain it and their policy, the list of streams, and files that grow."""
 
 import base64
 import gzip
@@ -11,15 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.errors import PlayerError
+from structgstream.codec.reader import StreamReader
+from structgstream.errors import PlayerError, StorageError, StreamError
 from structgstream.serve import pages
 from structgstream.serve.pages import (
     REFRESH_SECONDS,
+    StreamFile,
     bundle,
+    check_has_header,
     inline_module,
     linked_page,
     list_page,
     single_page,
+    write_page,
+    write_site,
 )
 from tests.support.streams import small_stream
 
@@ -192,3 +197,66 @@ def test_names_and_queries_are_texts(hostile: str) -> None:
     assert hostile in seen.shown
     assert seen.all("a", "href") == [f"streams/{hostile}/?token={hostile}"]
     assert not seen.of("script")
+
+
+HEADER_BYTES = StreamReader(STREAM).header_bytes
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> StreamFile:
+    return StreamFile(tmp_path / "s.sgs")
+
+
+def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamFile) -> None:
+    assert not file.has_header()
+    for length in (0, 5, 12, 13, HEADER_BYTES - 1, HEADER_BYTES, HEADER_BYTES + 3, len(STREAM) - 1, len(STREAM)):
+        file.path.write_bytes(STREAM[:length])
+        assert file.has_header() == (length >= HEADER_BYTES)
+        assert file.state() == {"bytes": length, "complete": length == len(STREAM)}
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is empty; expected a stream made by structgstream reconstruct"),
+        (b"hello, this is no stream", "is not a structgstream file"),
+        (STREAM[:10], "cut at byte 10"),
+        (STREAM[: HEADER_BYTES - 1], f"cut at byte {HEADER_BYTES - 1}, within the record that begins at byte 12"),
+        (STREAM[:8] + b"\x09\x00" + STREAM[10:], "version 9.0"),
+    ],
+)
+def test_what_cannot_be_shown_is_reported(file: StreamFile, data: bytes, words: str) -> None:
+    with pytest.raises(StreamError, match="No such file or directory"):
+        file.check()
+    file.path.write_bytes(data)
+    with pytest.raises(StreamError, match=words):
+        file.check()
+    with pytest.raises(StreamError, match=words):
+        check_has_header(data, "memory")
+
+
+def test_a_site_never_replaces_its_own_stream(tmp_path: Path) -> None:
+    path = tmp_path / "stream.sgs"
+    path.write_bytes(STREAM)
+    with pytest.raises(StorageError, match="is the stream itself"):
+        write_site(tmp_path, StreamFile(path))
+    assert path.read_bytes() == STREAM
+
+
+def test_a_site_replaces_an_earlier_one_and_no_other_page(file: StreamFile, tmp_path: Path) -> None:
+    file.path.write_bytes(STREAM)
+    page = tmp_path / "www" / "index.html"
+    for _ in range(2):
+        write_site(page.parent, file)
+    page.write_text("<h1>My pages</h1>")
+    with pytest.raises(StorageError, match="is another page"):
+        write_site(page.parent, file)
+    assert page.read_text() == "<h1>My pages</h1>"
+
+
+def test_what_cannot_be_shown_is_not_written(file: StreamFile, tmp_path: Path) -> None:
+    file.path.write_bytes(STREAM[:100])
+    for writing in (write_page, write_site):
+        with pytest.raises(StreamError, match="cut at byte 100"):
+            writing(tmp_path / "out", file)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s.sgs"]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server of ``structgstream play``, asked through a socket."""
+"""The server of ``structgstream play``, asked through a socket, and its pictures of a capture on demand."""
 
-import json
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,21 @@ import pytest
 
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
+from structgstream.data.source import FrameSource
+from structgstream.errors import CaptureError
 from structgstream.serve.pages import StreamFile, bundle
 from structgstream.serve.play import Truth
+from tests.support.memory_captures import MemoryCapture
 from tests.support.pictures import decoded_picture
 from tests.support.serving import Served, served
 from tests.support.streams import small_stream
 
 STREAM = small_stream(6)
+
+
+@pytest.fixture(scope="module")
+def source() -> FrameSource:
+    return open_capture(bundled_clip_path(), scale=0.5)
 
 
 @pytest.fixture
@@ -36,14 +45,14 @@ def test_the_page_the_player_and_the_state(server: Served) -> None:
     page = server.ask("/")
     assert page.status == 200
     assert page.headers["content-type"] == "text/html; charset=utf-8"
-    assert "<title>name &lt;&amp;&gt;.sgs</title>" in page.body.decode()
-    assert 'src="stream"' in page.body.decode()
-    assert "truth" not in page.body.decode()
+    assert "<title>name &lt;&amp;&gt;.sgs</title>" in page.text
+    assert 'src="stream"' in page.text
+    assert "truth" not in page.text
     module = server.ask("/player.js")
     assert module.headers["content-type"].startswith("text/javascript")
     assert module.body.decode() == bundle()
-    assert json.loads(server.ask("/state").body) == {"bytes": len(STREAM), "complete": True}
-    assert json.loads(server.ask("/truth.json").body) == []
+    assert server.ask("/state").json == {"bytes": len(STREAM), "complete": True}
+    assert server.ask("/truth.json").json == []
     assert server.ask("/truth/cam00/0.jpg").status == 404
 
 
@@ -55,11 +64,11 @@ def test_a_growing_file_is_asked_for_again_and_again(server: Served, file: Strea
         assert answer.status == 206
         seen += answer.body
         assert server.ask("/stream", Range=f"bytes={len(seen)}-").status == 416
-        assert json.loads(server.ask("/state").body) == {"bytes": len(seen), "complete": False}
+        assert server.ask("/state").json == {"bytes": len(seen), "complete": False}
         with file.path.open("ab") as growing:
             growing.write(STREAM[len(seen) : size])
     assert seen + server.ask("/stream", Range=f"bytes={len(seen)}-").body == STREAM
-    assert json.loads(server.ask("/state").body) == {"bytes": len(STREAM), "complete": True}
+    assert server.ask("/state").json == {"bytes": len(STREAM), "complete": True}
 
 
 def test_nothing_of_a_growing_file_is_cached_and_no_validator_restarts_a_download(server: Served) -> None:
@@ -100,11 +109,8 @@ def test_other_origins_may_not_read_and_the_page_loads_from_its_own_only(server:
     assert "http" not in " ".join(rules.values())
 
 
-def test_addresses_name_no_files(tmp_path: Path) -> None:
-    file = tmp_path / "s.sgs"
-    file.write_bytes(STREAM)
-    source = open_capture(bundled_clip_path(), scale=0.25, frames=1)
-    with served(StreamFile(file), truth=Truth(source, ("cam00",))) as server:
+def test_addresses_name_no_files(file: StreamFile, source: FrameSource) -> None:
+    with served(file, truth=Truth(source, ("cam00",))) as server:
         for path in (
             "/../../etc/passwd",
             "/stream/../../../etc/passwd",
@@ -121,14 +127,12 @@ def test_addresses_name_no_files(tmp_path: Path) -> None:
             assert b"root:" not in answer.body
 
 
-def test_pictures_of_the_capture(tmp_path: Path) -> None:
-    file = tmp_path / "s.sgs"
-    file.write_bytes(STREAM)
+def test_pictures_of_the_capture(file: StreamFile) -> None:
     source = open_capture(bundled_clip_path(), frames=3)
     names = tuple(source.rig)
-    with served(StreamFile(file), truth=Truth(source, names)) as server:
-        assert 'truth="truth.json"' in server.ask("/").body.decode()
-        assert json.loads(server.ask("/truth.json").body) == list(names)
+    with served(file, truth=Truth(source, names)) as server:
+        assert 'truth="truth.json"' in server.ask("/").text
+        assert server.ask("/truth.json").json == list(names)
         answer = server.ask(f"/truth/{names[3]}/2.jpg")
         for missing in (f"{names[3]}/3", f"{names[3]}/-1", "nobody/0", f"{names[3]}/x", f"{names[3]}/1e0"):
             assert server.ask(f"/truth/{missing}.jpg").status == 404
@@ -137,3 +141,47 @@ def test_pictures_of_the_capture(tmp_path: Path) -> None:
     taken = list(source.frames())[2].images[names[3]]
     assert picture.shape == taken.shape
     assert np.abs(picture.astype(int) - taken).mean() < 3
+
+
+def test_any_order_gives_the_camera_and_frame_that_was_asked_for(source: FrameSource) -> None:
+    frames = list(source.frames())
+    taken = {(name, frame.index): frame.images[name] for frame in frames for name in ("cam00", "cam04")}
+    truth = Truth(source, ("cam00", "cam04"))
+    for camera, frame in [("cam00", 0), ("cam00", 1), ("cam00", 5), ("cam00", 4), ("cam04", 5), ("cam04", 0)]:
+        picture = decoded_picture(truth.jpeg(camera, frame) or b"").astype(int)
+        errors = {at: float(np.abs(picture - other).mean()) for at, other in taken.items()}
+        assert min(errors, key=errors.__getitem__) == (camera, frame)
+        assert errors[camera, frame] < 3
+
+
+def test_what_was_asked_for_is_not_decoded_again(source: FrameSource) -> None:
+    truth = Truth(source, ("cam00",))
+    assert truth.jpeg("cam00", 3) is truth.jpeg("cam00", 3)
+
+
+def test_nobody_and_never(source: FrameSource) -> None:
+    truth = Truth(source, ("cam00",))
+    assert [truth.jpeg(camera, frame) for camera, frame in [("cam01", 0), ("cam00", 12), ("cam00", -1)]] == [None] * 3
+
+
+def test_a_video_that_breaks_is_reported_and_asked_again(tmp_path: Path) -> None:
+    folder = tmp_path / "clip"
+    shutil.copytree(bundled_clip_path(), folder)
+    truth = Truth(open_capture(folder), ("cam00",))
+    assert truth.jpeg("cam00", 0)
+    video = folder / "cam00.mp4"
+    whole = video.read_bytes()
+    video.unlink()
+    with pytest.raises(CaptureError, match=r"cam00\.mp4"):
+        truth.jpeg("cam00", 10)
+    video.write_bytes(whole)
+    assert truth.jpeg("cam00", 10)
+
+
+def test_a_camera_that_is_absent_from_a_frame_has_no_picture_there(source: FrameSource) -> None:
+    frames = list(source.frames())
+    others = {name: image for name, image in frames[1].images.items() if name != "cam00"}
+    frames[1] = replace(frames[1], images=others)
+    truth = Truth(MemoryCapture(source.rig, frames), ("cam00", "cam04"))
+    assert [truth.jpeg("cam00", frame) is None for frame in range(3)] == [False, True, False]
+    assert truth.jpeg("cam04", 1) is not None

@@ -232,7 +232,7 @@ def test_only_a_named_proxy_states_the_client(folder: Path) -> None:
         with hosted(ServerSettings(folder), proxies=proxies) as server:
             for address in ("198.51.100.1", "203.0.113.7, 198.51.100.1", "198.51.100.2"):
                 server.ask("/streams/studio/manifest.json", X_Forwarded_For=address)
-            assert f'structgstream_viewers{{stream="studio"}} {viewers}.0' in server.ask("/metrics").body.decode()
+            assert f'structgstream_viewers{{stream="studio"}} {viewers}.0' in server.ask("/metrics").text
 
 
 def test_a_server_that_cannot_open_files_says_so(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 
 import base64
 import hmac
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -175,20 +174,20 @@ def test_a_token_of_another_stream_and_one_that_expired(server: Served, tmp_path
 
 
 def test_the_list_shows_what_the_token_opens_and_passes_it_on(server: Served) -> None:
-    page = server.ask(f"/?token={TOKEN}").body.decode()
+    page = server.ask(f"/?token={TOKEN}").text
     assert f'href="streams/studio/?token={TOKEN}"' in page
     assert f"streams/studio/preview?token={TOKEN}&quot;" in page
     assert "ball" not in page
     every = KEYS.token(EVERY_STREAM, expires_unix_seconds=int(NOW) + 60)
-    names = [one["name"] for one in json.loads(server.ask(f"/streams.json?token={every}").body)["streams"]]
+    names = [one["name"] for one in server.ask(f"/streams.json?token={every}").json["streams"]]
     assert names == ["ball.sgs", "studio"]
     assert server.ask("/metrics", Authorization=f"Bearer {every}").status == 200
 
 
 def test_the_page_passes_its_token_on(server: Served) -> None:
     page = server.ask(f"/streams/studio/?token={TOKEN}&x=<b>")
-    assert f'src="manifest.json?token={TOKEN}"' in page.body.decode()
-    assert "<b>" not in page.body.decode()
+    assert f'src="manifest.json?token={TOKEN}"' in page.text
+    assert "<b>" not in page.text
     assert page.headers["referrer-policy"] == "no-referrer"
     assert page.headers["cache-control"] == "no-store"
 

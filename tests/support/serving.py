@@ -2,6 +2,7 @@
 """The real servers in a thread, for tests that talk to them through a socket."""
 
 import http.client
+import json
 import socket
 import threading
 import time
@@ -24,6 +25,14 @@ class Answer:
     status: int
     headers: dict[str, str]
     body: bytes
+
+    @property
+    def text(self) -> str:
+        return self.body.decode()
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
 
 
 @dataclass(frozen=True)

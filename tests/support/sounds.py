@@ -4,6 +4,7 @@
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -44,12 +45,18 @@ def write_sound(path: Path, samples: NDArray[np.float32], *, rate: int = SAMPLE_
 
 
 def add_sound(
-    video: Path, output: Path, samples: NDArray[np.float32], *, rate: int = SAMPLE_RATE, start: float = 0.0
+    video: Path,
+    output: Path,
+    samples: NDArray[np.float32],
+    *,
+    rate: int = SAMPLE_RATE,
+    start: float = 0.0,
+    codec: str = "aac",
 ) -> Path:
-    """The same video with AAC sound that begins at ``start`` seconds."""
+    """The same video with sound that begins at ``start`` seconds."""
     with av.open(str(video)) as given, av.open(str(output), "w") as container:
         pictures = container.add_stream_from_template(given.streams.video[0])
-        stream = container.add_stream("aac", rate=rate)
+        stream: Any = container.add_stream(codec, rate=rate)
         stream.layout = layout_of(len(samples))
         for packet in given.demux(given.streams.video[0]):
             if packet.size:

@@ -147,7 +147,7 @@ def play(arguments: list[str]) -> None:
         _wait_for(stream)
     stream.check()
     truth = None if options.capture is None else _truth(options.stream, options.capture)
-    growing = not stream.state()[1]
+    growing = not stream.state()["complete"]
 
     def announce(address: str) -> None:
         lines = [f"{options.stream} plays at {address} (Ctrl-C ends)."]

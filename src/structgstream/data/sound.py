@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sound of cameras and of separate recorders: as samples to synchronise by, and as Opus packets in presentation time.
+"""Sound of cameras, live ones too, and of separate recorders: as samples to synchronise by, and as Opus packets in
+presentation time.
 
 Note [Sound in step]
 ~~~~~~~~~~~~~~~~~~~~
@@ -9,6 +10,9 @@ that ten minutes later they are still in step. Gaps in the time stamps become si
 """
 
 import logging
+import math
+import threading
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -41,6 +45,12 @@ GAP_SECONDS = 0.03
 SAME_RATE = 1e-7
 """Rates of clocks that differ from 1 by less count as 1: 0.4 ms in an hour."""
 RATE_FACTOR = 1000  # Rates in hertz are whole numbers; those of clocks differ from 1 by millionths.
+MAX_EARLY = 4096
+"""Frames of sound that wait for the first set of pictures, which states when presentation begins; 87 s of AAC."""
+MAX_WAITING = 2**16 - 1
+"""Packets that wait for the next frame: 21 minutes, as many as it can have."""
+MAX_SILENCE_SECONDS = 10.0
+"""After a longer gap sound begins again instead of being silent that long."""
 
 
 class SoundFeed(Protocol):
@@ -83,11 +93,9 @@ class SoundEncoder:
         self._rate = rate if abs(rate - 1.0) > SAME_RATE else 1.0
         self._resampler: Any = None
         self._of: tuple[int, str, str] | None = None  # rate, layout and sample format of the frames
-        self._base: float | None = None  # presentation time of the first sample of the resampler
+        self._base = 0.0  # presentation time of the first sample of the resampler
         self._taken = self._given = 0  # samples that the resampler has taken and given
-        self._at = round(start_seconds * SAMPLE_RATE)  # samples from presentation time 0 on
-        self._rest = np.zeros((0, channels), np.float32)
-        self._encoded = self._at
+        self._start = self._at = round(start_seconds * SAMPLE_RATE)  # samples from presentation time 0 on
         codec = av.CodecContext.create("libopus", "w")
         codec.sample_rate, codec.layout, codec.format = SAMPLE_RATE, self._layout, "flt"
         codec.bit_rate = BITS_PER_SECOND[channels]
@@ -97,17 +105,13 @@ class SoundEncoder:
         self._codec: Any = codec
 
     def add(self, frame: "AudioFrame", seconds: float | None) -> list[OpusPacket]:
-        """The packets that are complete with another frame.
-
-        Args:
-            seconds: presentation time of its first sample; None where it follows the one before.
-        """
+        """The packets that are complete with another frame, whose first sample sounds at ``seconds`` of presentation
+        time; None where it follows the one before."""
         kind = frame.sample_rate, frame.layout.name, frame.format.name
         packets: list[OpusPacket] = []
         if kind != self._of:
             packets = self._flush()
             self._begin(kind, 0.0 if seconds is None else seconds)
-        assert self._base is not None
         if seconds is not None:
             gap = seconds - self._base - self._rate * self._taken / kind[0]
             self._base += gap if abs(gap) > GAP_SECONDS else 0.0
@@ -119,10 +123,7 @@ class SoundEncoder:
 
     def finish(self) -> list[OpusPacket]:
         """The last packets; the last one ends with silence."""
-        packets = self._flush()
-        if len(self._rest):
-            packets += self._blocks(np.zeros((PACKET_SAMPLES - len(self._rest), self._channels), np.float32))
-        return packets + self._packets(None)
+        return self._flush() + self._silence((self._start - self._at) % PACKET_SAMPLES) + self._encoded(None)
 
     def _begin(self, kind: tuple[int, str, str], seconds: float) -> None:
         factor = 1 if self._rate == 1.0 else RATE_FACTOR
@@ -137,59 +138,46 @@ class SoundEncoder:
         packets: list[OpusPacket] = []
         for part in self._resampler.resample(frame):
             samples = part.to_ndarray().reshape(-1, self._channels)
-            assert self._base is not None
-            packets += self._place(samples, round((self._base + self._given / SAMPLE_RATE) * SAMPLE_RATE))
+            packets += self._placed(samples, round((self._base + self._given / SAMPLE_RATE) * SAMPLE_RATE))
             self._given += len(samples)
         return packets
 
-    def _place(self, samples: NDArray[np.float32], first: int) -> list[OpusPacket]:
+    def _placed(self, samples: NDArray[np.float32], first: int) -> list[OpusPacket]:
         """Samples of which the first is number ``first`` from presentation time 0 on."""
         missing = first - self._at
-        packets: list[OpusPacket] = []
-        while missing > 1:  # One is rounding.
-            silence = np.zeros((min(missing, SAMPLE_RATE), self._channels), np.float32)
-            packets += self._blocks(silence)
-            missing -= len(silence)
-        return packets + self._blocks(samples[-missing:] if missing < -1 else samples)
+        if missing > 1:  # One is rounding.
+            return self._silence(missing) + self._following(samples)
+        return self._following(samples[-missing:] if missing < -1 else samples)
 
-    def _blocks(self, samples: NDArray[np.float32]) -> list[OpusPacket]:
-        self._at += len(samples)
-        joined = np.concatenate([self._rest, samples])
-        whole = len(joined) // PACKET_SAMPLES * PACKET_SAMPLES
-        self._rest = joined[whole:]
+    def _silence(self, count: int) -> list[OpusPacket]:
         packets: list[OpusPacket] = []
-        for start in range(0, whole, PACKET_SAMPLES):
-            block = np.ascontiguousarray(joined[start : start + PACKET_SAMPLES]).reshape(1, -1)
-            frame = load_av().AudioFrame.from_ndarray(block, format="flt", layout=self._layout)
-            frame.sample_rate, frame.pts, frame.time_base = SAMPLE_RATE, self._encoded, Fraction(1, SAMPLE_RATE)
-            self._encoded += PACKET_SAMPLES
-            packets += self._packets(frame)
+        for start in range(0, count, SAMPLE_RATE):
+            packets += self._following(np.zeros((min(count - start, SAMPLE_RATE), self._channels), np.float32))
         return packets
 
-    def _packets(self, frame: "AudioFrame | None") -> list[OpusPacket]:
+    def _following(self, samples: NDArray[np.float32]) -> list[OpusPacket]:
+        if not len(samples):
+            return []
+        frame = load_av().AudioFrame.from_ndarray(samples.reshape(1, -1), format="flt", layout=self._layout)
+        frame.sample_rate, frame.pts, frame.time_base = SAMPLE_RATE, self._at, Fraction(1, SAMPLE_RATE)
+        self._at += len(samples)
+        return self._encoded(frame)
+
+    def _encoded(self, frame: "AudioFrame | None") -> list[OpusPacket]:
+        """Complete packets: the encoder divides frames of any length."""
         return [OpusPacket(packet.pts / SAMPLE_RATE, bytes(packet)) for packet in self._codec.encode(frame)]
 
 
 @dataclass(frozen=True)
 class SoundFile:
-    """The sound of a file.
+    """The sound of a file."""
 
-    Args:
-        name: of the camera, or of the file.
-        path: of the file.
-        clock: from seconds of the file to presentation times.
-    """
-
-    name: str
-    path: Path
-    clock: Clock
+    name: str  # of the camera, or of the file
+    path: Path  # of the file
+    clock: Clock  # from seconds of the file to presentation times
 
     def open(self) -> "FileFeed":
-        """See :class:`SoundSource`.
-
-        Raises:
-            CaptureError: the file cannot be opened, or has no sound.
-        """
+        """See :class:`SoundSource`. Raises CaptureError if the file cannot be opened, or has no sound."""
         with open_sound(self.path) as container:
             stream = sound_stream(container, self.path)
             return FileFeed(self, min(stream.codec_context.channels, 2))
@@ -242,12 +230,78 @@ class FileFeed:
         yield from encoder.finish()
 
 
-def sound_stream(container: Any, path: Path) -> "AudioStream":
-    """The sound of an opened file.
+class LiveSound:
+    """The sound of one live camera, mixed to one channel, encoded as it arrives; thread-safe."""
 
-    Raises:
-        CaptureError: it has none.
-    """
+    channels = 1
+
+    def __init__(self, camera: str) -> None:
+        self.name = camera
+        self._lock = threading.Lock()
+        self._feeds: list[LiveFeed] = []
+        self._early: deque[tuple[AudioFrame, float]] = deque(maxlen=MAX_EARLY)
+        self._encoder: SoundEncoder | None = None
+        self._origin: float | None = None
+        self._end = -math.inf  # presentation time up to which there is sound
+
+    def open(self) -> "LiveFeed":
+        """See ``SoundSource``: what arrives from now on."""
+        feed = LiveFeed()
+        with self._lock:
+            self._feeds.append(feed)
+        return feed
+
+    def synchronize(self, origin: float) -> None:
+        """States the common clock at presentation time 0, with each frame: a clock may be reset."""
+        with self._lock:
+            self._origin = origin
+            while self._early:
+                self._encode(*self._early.popleft())
+
+    def add(self, frame: "AudioFrame", seconds: float) -> None:
+        """A frame of sound whose first sample was heard at ``seconds`` on the common clock."""
+        with self._lock:
+            if self._origin is None:
+                self._early.append((frame, seconds))
+            else:
+                self._encode(frame, seconds)
+
+    def _encode(self, frame: "AudioFrame", seconds: float) -> None:
+        assert self._origin is not None
+        begin = seconds - self._origin
+        end = begin + frame.samples / frame.sample_rate
+        if end <= 0:
+            return
+        if self._encoder is None or begin - self._end > MAX_SILENCE_SECONDS:
+            self._encoder = SoundEncoder(self.channels, start_seconds=max(begin, 0.0))
+        packets = self._encoder.add(frame, begin)
+        self._end = max(self._end, end)
+        for feed in self._feeds:
+            feed.add(packets)
+
+
+class LiveFeed:
+    """What has arrived and was not taken yet; thread-safe, as a deque is."""
+
+    channels = LiveSound.channels
+
+    def __init__(self) -> None:
+        self._packets: deque[OpusPacket] = deque(maxlen=MAX_WAITING)
+
+    def add(self, packets: list[OpusPacket]) -> None:
+        """Further packets."""
+        self._packets.extend(packets)
+
+    def until(self, seconds: float) -> list[OpusPacket]:
+        """See ``SoundFeed``."""
+        found = []
+        while self._packets and self._packets[0].seconds < seconds:
+            found.append(self._packets.popleft())
+        return found
+
+
+def sound_stream(container: Any, path: Path) -> "AudioStream":
+    """The sound of an opened file. Raises CaptureError if it has none."""
     if not container.streams.audio:
         raise CaptureError(f"{path} has no sound; choose another camera or file with --sound.")
     if (count := len(container.streams.audio)) > 1:
@@ -256,21 +310,14 @@ def sound_stream(container: Any, path: Path) -> "AudioStream":
 
 
 def has_sound(path: Path) -> bool:
-    """Whether a file has sound.
-
-    Raises:
-        CaptureError: it cannot be opened.
-    """
+    """Whether a file has sound. Raises CaptureError if it cannot be opened."""
     with open_sound(path) as container:
         return bool(container.streams.audio)
 
 
 def camera_clock(source: FrameSource, camera: str) -> tuple[Path, Clock] | None:
-    """The video of a camera, and the clock from its seconds to presentation times; None without a video.
-
-    Raises:
-        ConfigError: frames are not shown at the rate at which they were filmed.
-    """
+    """The video of a camera, and the clock from its seconds to presentation times; None without a video. Raises
+    ConfigError as :func:`start_seconds`."""
     filmed = innermost(source)
     if not isinstance(filmed, VideoSource) or camera not in filmed.tracks:
         return None
@@ -287,11 +334,8 @@ def camera_clock(source: FrameSource, camera: str) -> tuple[Path, Clock] | None:
 
 
 def start_seconds(source: FrameSource) -> float:
-    """Presentation time of the first frame of the whole capture: not above 0.
-
-    Raises:
-        ConfigError: frames are not shown at the rate at which they were filmed.
-    """
+    """Presentation time of the first frame of the whole capture: not above 0. Raises ConfigError if frames are not
+    shown at the rate at which they were filmed."""
     if not isinstance(source, SourceWrapper):
         return 0.0
     if isinstance(source, EveryNthFrame) and source.rate is not None:
@@ -329,11 +373,8 @@ class SoundDecoder:
 
 @contextmanager
 def open_sound(path: Path) -> Iterator[Any]:
-    """An opened file, of which only the sound is read.
-
-    Raises:
-        CaptureError: it is missing, or holds nothing that can be read.
-    """
+    """An opened file, of which only the sound is read. Raises CaptureError if it is missing, or holds nothing that can
+    be read."""
     av = load_av()
     try:
         container = av.open(str(path), metadata_errors="replace")

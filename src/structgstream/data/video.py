@@ -175,11 +175,8 @@ MIN_PERIOD = 5e-4
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:
-    """Frames a second of the common timeline by time stamp (``timeline.measured_rate``); None for one frame.
-
-    Raises:
-        CaptureError: most frames of a video have the time of the one before.
-    """
+    """Frames a second of the common timeline by time stamp (``timeline.measured_rate``); None for one frame. Raises
+    CaptureError if most frames of a video have the time of the one before."""
     for track in tracks.values():
         if len(track.stamps) > 1 and period_seconds(track.seconds) < MIN_PERIOD:
             raise CaptureError(
@@ -200,11 +197,11 @@ def _common_times(
     """
     if clocks is not None:
         return {name: clocks.get(name, Clock()).common_seconds(track.seconds) for name, track in tracks.items()}
-    is_mixed = len({track.container for track in tracks.values()}) > 1
-    starts = {
-        name: track.start if is_mixed and track.container in STREAM_FORMATS else 0 for name, track in tracks.items()
+    shifted = STREAM_FORMATS if len({track.container for track in tracks.values()}) > 1 else ()
+    return {
+        name: track.seconds - track.tick_seconds * (track.start if track.container in shifted else 0)
+        for name, track in tracks.items()
     }
-    return {name: track.seconds - starts[name] * track.tick_seconds for name, track in tracks.items()}
 
 
 Damage = Callable[[int, int | None, str], None]

@@ -181,9 +181,10 @@ def _scan(path: Path) -> VideoTrack:
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
         colors = stated_colors(path, first)
-        keyframes, kind = tuple(sorted(keys)), container.format.name
-        aspect = float(stream.sample_aspect_ratio or 1)
-        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start, aspect)
+        return VideoTrack(
+            path, tuple(stamps), seconds, *size, turns, tuple(sorted(keys)), colors, origin, container.format.name,
+            start, float(stream.sample_aspect_ratio or 1),
+        )  # fmt: skip
 
 
 def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:
@@ -266,12 +267,8 @@ def transfer_of(frame: "VideoFrame") -> int:
 
 
 def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
-    """What a video states of its colours by one of its frames, in words; None where none decodes.
-
-    Raises:
-        CaptureError: a transfer function or a matrix that is not converted, or wide primaries without HLG or PQ, as
-            log videos have.
-    """
+    """What a video states of its colours by one of its frames, in words; None where none decodes. Raises CaptureError
+    for a transfer function or a matrix that is not converted, and for wide primaries without HLG or PQ."""
     if frame is None:
         return "no frame decodes"
     transfer, primaries = transfer_of(frame), int(getattr(frame, "color_primaries", UNSPECIFIED))

@@ -24,22 +24,15 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     """Writes an mp4, picture by picture, all of one size, at ``fps`` frames a second; a missing folder is made.
 
     The file gets its name when the ``with`` block ends without an error, so it is never incomplete. Odd sizes are
-    padded by one pixel, because 4:2:0 needs even ones.
-
-    Args:
-        channels: of sound, 1 or 2; None for no sound.
-
-    Raises:
-        StorageError: the file cannot be written, or this PyAV has no H.264 encoder.
+    padded by one pixel, because 4:2:0 needs even ones. Sound has 1 or 2 ``channels``, None for none. Raises
+    StorageError if the file cannot be written, also later, or this PyAV has no H.264 encoder.
     """
 
     def __init__(self, path: Path, *, fps: float, channels: int | None = None) -> None:
-        av = load_av()
-        self.path = path
-        self._part = partial_path(path)
+        self._av = av = load_av()
+        self.path, self._part = path, partial_path(path)
         self._fps = Fraction(fps).limit_denominator(1001)
         self._count = 0
-        self._av = av
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._container = av.open(str(self._part), "w", format="mp4", options={"movflags": "+faststart"})
@@ -73,14 +66,8 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         self._mux(frame)
 
     def write_sound(self, samples: NDArray[np.float32], *, seconds: float) -> None:
-        """Adds sound ``[N, channels]`` in [-1, 1] at 48 kHz, later than all before; what lies before 0 is left out.
-
-        Args:
-            seconds: when its first sample sounds.
-
-        Raises:
-            StorageError: the disk is full.
-        """
+        """Adds sound ``[N, channels]`` in [-1, 1] at 48 kHz, later than all before, whose first sample sounds at
+        ``seconds``; what lies before 0 is left out."""
         assert self._sound is not None, "made with channels"
         missing = round(seconds * SAMPLE_RATE) - self._heard
         silence = np.zeros((max(missing, 0), samples.shape[1]), np.float32)

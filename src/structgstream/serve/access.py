@@ -50,11 +50,8 @@ class TokenKeys:
     secrets: tuple[bytes, ...]
 
     def token(self, stream: str, *, expires_unix_seconds: int) -> str:
-        """A token for ``stream``, or for every stream with :data:`EVERY_STREAM`.
-
-        Raises:
-            ConfigError: no stream can have this name.
-        """
+        """A token for ``stream``, or for every stream with :data:`EVERY_STREAM`. Raises ConfigError if no stream can
+        have this name."""
         if stream != EVERY_STREAM and not is_stream_name(stream):
             raise ConfigError(
                 f"{stream!r} is no name of a stream; expected letters, digits, dots, dashes and underscores."
@@ -110,9 +107,7 @@ class Refused(Exception):
 
     def __init__(self, status: int, text: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(text)
-        self.status = status
-        self.text = text
-        self.headers = headers or {}
+        self.status, self.text, self.headers = status, text, headers or {}
 
 
 def token_of(request: "Request") -> str | None:
@@ -136,8 +131,7 @@ class Authorizer:
 
     def check(self, request: "Request", name: str) -> None:
         """Check that a request has access to the stream ``name``. Raises Refused if it has none."""
-        access = self.access(request, name)
-        if access is not Access.GRANTED:
+        if (access := self.access(request, name)) is not Access.GRANTED:
             raise refusal(access)
 
     def page_query(self, request: "Request") -> str:

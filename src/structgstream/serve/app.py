@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from anyio import to_thread
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -30,15 +31,14 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from structgstream.codec.container.byte_source import FileBytes
-from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
 from structgstream.errors import StreamError
 from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
-from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
-from structgstream.serve.pages import SERVED_POLICY, bundle, linked_page, list_page, policy
+from structgstream.serve.metrics import CountRequests, Metrics, exposition, run_numbers, stream_families
+from structgstream.serve.pages import SERVED_POLICY, bundle, file_state, linked_page, list_page, policy
 from structgstream.serve.responses import NO_STORE_HEADERS, content_response, file_response
 from structgstream.serve.streams import (
     Catalog,
@@ -137,9 +137,7 @@ class _Routes:
 
     async def index(self, request: Request) -> Response:
         """The page of all streams that the token gives access to."""
-        page = list_page(await self._listed(request), query=self._authorizer.page_query(request))
-        rules = policy(frame_ancestors="'self'")
-        return HTMLResponse(page, headers={**self._headers, "Content-Security-Policy": rules})
+        return self._html(list_page(await self._listed(request), query=self._authorizer.page_query(request)))
 
     async def listing(self, request: Request) -> Response:
         """The same as JSON."""
@@ -167,7 +165,7 @@ class _Routes:
         runs = {stream.name: await to_thread.run_sync(_run_numbers, stream) for stream in streams}
         gauges = stream_families(manifests, waiters=self._manifests.waiters, runs=runs, unix_seconds=self._clock())
         content = exposition([*self._metrics.families(), *gauges])
-        return Response(content, headers={**self._headers, "Content-Type": CONTENT_TYPE})
+        return Response(content, headers={**self._headers, "Content-Type": CONTENT_TYPE_LATEST})
 
     async def without_slash(self, request: Request) -> Response:
         """Redirects to the page; the redirect is relative, so that it works behind a proxy."""
@@ -181,8 +179,7 @@ class _Routes:
         request.scope["counted_as"] = (stream.name, "page")
         address = f"{stream.kind.source}{self._authorizer.page_query(request)}"
         page = linked_page(stream.name, stream=address, module="../../player.js")
-        rules = policy(**SERVED_POLICY, frame_ancestors="'self'")
-        return HTMLResponse(page, headers={**self._headers, "Content-Security-Policy": rules})
+        return self._html(page, **SERVED_POLICY)
 
     async def file(self, request: Request) -> Response:
         """A file of a stream or of one of its renditions."""
@@ -198,6 +195,13 @@ class _Routes:
         if stream.kind is StreamKind.FILE and file in ("stream.sgs", "state"):
             return await self._growing(stream, request, state=file == "state")
         raise Refused(404, f"{stream.name} has no such file.")
+
+    def _html(self, page: str, **sources: str) -> Response:
+        rules = policy(**sources, frame_ancestors="'self'")
+        return HTMLResponse(page, headers={**self._headers, "Content-Security-Policy": rules})
+
+    def _small(self, content: bytes, request: Request, caching: str, media_type: str) -> Response:
+        return content_response(content, request, {**self._headers, "Cache-Control": caching}, media_type=media_type)
 
     async def _streams(self) -> Mapping[str, ServedStream]:
         return await to_thread.run_sync(self._catalog.found)
@@ -240,8 +244,7 @@ class _Routes:
     async def _renditions(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "qualities")
         content = _found(await _content(await to_thread.run_sync(stream.open, QUALITIES), MAX_LIST_BYTES), stream)
-        headers = {**self._headers, "Cache-Control": self._revalidated}
-        return content_response(content, request, headers, media_type="application/json")
+        return self._small(content, request, self._revalidated, "application/json")
 
     async def _manifest(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "manifest")
@@ -251,8 +254,7 @@ class _Routes:
             found = await watch.current()
         else:
             found = await _while_connected(watch.newer(after, seconds=self._wait_seconds), request)
-        headers = {**self._headers, "Cache-Control": self._revalidated}
-        return content_response(_found(found, stream).content, request, headers, media_type="application/json")
+        return self._small(_found(found, stream).content, request, self._revalidated, "application/json")
 
     async def _immutable(self, stream: ServedStream, file: str, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, file.partition("-")[0])
@@ -269,8 +271,7 @@ class _Routes:
         if not state:
             return file_response(opened, request, self._headers)
         with opened:
-            values = {"bytes": len(opened), "complete": footer_offset(opened) is not None}
-        return JSONResponse(values, headers=self._headers)
+            return JSONResponse(file_state(opened), headers=self._headers)
 
     async def _preview(self, stream: ServedStream, request: Request) -> Response:
         """``preview.png`` or ``.jpg`` of segments, else ``NAME.preview.png`` or ``.jpg`` next to the stream."""
@@ -279,8 +280,7 @@ class _Routes:
         media_type = next((kind for start, kind in _PICTURES.items() if (content or b"").startswith(start)), None)
         if content is None or media_type is None:
             raise Refused(404, f"{stream.name} has no preview picture.")
-        headers = {**self._headers, "Cache-Control": f"{self._visibility}, max-age=30"}
-        return content_response(content, request, headers, media_type=media_type)
+        return self._small(content, request, f"{self._visibility}, max-age=30", media_type)
 
 
 def _found(something: T | None, stream: ServedStream) -> T:

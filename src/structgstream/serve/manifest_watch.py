@@ -60,12 +60,8 @@ class ManifestWatch:
         self.waiters = 0
 
     async def current(self) -> Snapshot | None:
-        """The manifest, at most a tenth of a second old; None if there is none.
-
-        Raises:
-            BrokenManifest: the file is no manifest.
-            OSError: the system cannot open files now.
-        """
+        """The manifest, at most a tenth of a second old; None if there is none. Raises BrokenManifest if the file is
+        none, OSError if the system cannot open files now."""
         async with self._lock:
             if self._clock() - self._read_at >= POLL_SECONDS:
                 await self._poll()
@@ -74,14 +70,8 @@ class ManifestWatch:
         return self._found
 
     async def newer(self, after: int, *, seconds: float) -> Snapshot | None:
-        """The manifest when its sequence exceeds ``after`` or it changes, or the current one after ``seconds``.
-
-        The manifest of a finished stream is returned immediately.
-
-        Raises:
-            BrokenManifest: the file is no manifest.
-            OSError: the system cannot open files now.
-        """
+        """The manifest when its sequence exceeds ``after`` or it changes, or the current one after ``seconds``; that
+        of a finished stream at once. Raises as :meth:`current`."""
         self.waiters += 1  # Before the first await, so that concurrent requests see it.
         try:
             first = found = await self.current()

@@ -5,10 +5,12 @@ import json
 import re
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
+from types import SimpleNamespace
 from typing import Any, Final
 
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -17,7 +19,6 @@ from structgstream.serve.manifest_watch import Snapshot
 VIEWER_SECONDS: Final = 30.0
 MAX_VIEWERS: Final = 10_000
 MAX_RUN_NUMBERS: Final = 500
-CONTENT_TYPE: Final = CONTENT_TYPE_LATEST
 
 
 class Viewers:
@@ -42,19 +43,12 @@ class Viewers:
 
 
 class Metrics:
-    """Counters of one server.
-
-    Attributes:
-        requests: number of responses by stream, kind and status.
-        sent_bytes: bytes of response bodies by stream.
-        in_progress: number of requests that are being answered.
-        viewers: present viewers of each stream.
-    """
+    """Counters of one server."""
 
     def __init__(self) -> None:
-        self.requests: Counter[tuple[str, str, int]] = Counter()
-        self.sent_bytes: Counter[str] = Counter()
-        self.in_progress = 0
+        self.requests: Counter[tuple[str, str, int]] = Counter()  # responses by stream, kind and status
+        self.sent_bytes: Counter[str] = Counter()  # of response bodies, by stream
+        self.in_progress = 0  # requests that are being answered
         self.viewers = Viewers()
 
     def families(self) -> list[Metric]:
@@ -136,19 +130,9 @@ def stream_families(
     ]
 
 
-class _Collected:
-    """Adapter from metric families to a Prometheus registry."""
-
-    def __init__(self, families: Iterable[Metric]) -> None:
-        self._families = families
-
-    def collect(self) -> Iterable[Metric]:
-        return self._families
-
-
 def exposition(families: Iterable[Metric]) -> bytes:
     """The families in the text format of Prometheus."""
-    return generate_latest(_Collected(families))  # type: ignore[arg-type]
+    return generate_latest(SimpleNamespace(collect=lambda: families))  # type: ignore[arg-type]
 
 
 def run_numbers(content: bytes) -> dict[str, float]:
@@ -159,17 +143,15 @@ def run_numbers(content: bytes) -> dict[str, float]:
     """
     try:
         values = json.loads(content)
+        return dict(islice(_numbers(values), MAX_RUN_NUMBERS)) if isinstance(values, dict) else {}
     except (ValueError, RecursionError):
         return {}
-    found: dict[str, float] = {}
-    _collect(values, "", found)
-    return found
 
 
-def _collect(values: Any, path: str, found: dict[str, float]) -> None:
+def _numbers(values: Any, *path: str) -> Iterator[tuple[str, float]]:
     if isinstance(values, dict):
         for key, value in values.items():
             name = re.sub(r"[^a-z0-9]+", "_", str(key).lower()[:64]).strip("_") or "unnamed"
-            _collect(value, f"{path}_{name}" if path else name, found)
-    elif isinstance(values, (int, float)) and path and len(found) < MAX_RUN_NUMBERS and abs(values) < 2**63:
-        found[path] = float(values)
+            yield from _numbers(value, *path, name)
+    elif isinstance(values, (int, float)) and abs(values) < 2**63:
+        yield "_".join(path), float(values)

@@ -15,7 +15,7 @@ import base64
 import hashlib
 import html
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -104,7 +104,7 @@ def linked_page(
     gets further ``attributes``."""
     script = f'{_NOT_LOADED_STYLE}<script type="module" src="{html.escape(module)}"></script>'
     body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
-    return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
+    return _html(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
 
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
@@ -121,7 +121,7 @@ def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     rules = policy(script_src=f"'sha256-{digest}' blob:", connect_src="blob: data:")
     data = '<script type="application/octet-stream;base64" id="stream">'
     element = f'{_element({"src": "#stream"})}<script type="module">{inlined}</script>\n{_NO_SCRIPT}'
-    page = html_page(title, head=f"{_PLAYER_STYLE}{data}</script>", body=element, rules=rules)
+    page = _html(title, head=f"{_PLAYER_STYLE}{data}</script>", body=element, rules=rules)
     before, after = page.split(data)
     return b"".join((before.encode(), data.encode(), base64.b64encode(stream[:]), after.encode()))
 
@@ -142,8 +142,7 @@ def _element(attributes: Mapping[str, str]) -> str:
     return f"<structgstream-player{written} autoplay loop></structgstream-player>"
 
 
-def html_page(title: str, *, head: str, body: str, rules: str) -> str:
-    """A whole page."""
+def _html(title: str, *, head: str, body: str, rules: str) -> str:
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -166,7 +165,7 @@ def list_page(streams: Sequence[Mapping[str, Any]], *, query: str) -> str:
     entries = "\n".join(_entry(stream, query) for stream in streams)
     body = f"<h1>Streams</h1>\n<ul>\n{entries}\n</ul>" if streams else "<h1>Streams</h1>\n<p>There is none yet.</p>"
     refresh = f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">\n'
-    return html_page("Streams", head=refresh + _LIST_STYLE, body=body, rules=policy())
+    return _html("Streams", head=refresh + _LIST_STYLE, body=body, rules=policy())
 
 
 def _entry(stream: Mapping[str, Any], query: str) -> str:
@@ -212,11 +211,10 @@ class StreamFile:
             )
         return stored
 
-    def state(self) -> tuple[int, bool]:
-        """Length of the file in bytes, and whether it is complete (has its index). Raises StreamError if it cannot be
-        read."""
+    def state(self) -> dict[str, int | bool]:
+        """The ``bytes`` of the file, and whether it is ``complete``. Raises StreamError if it cannot be read."""
         with self.opened() as data:
-            return len(data), footer_offset(data) is not None
+            return file_state(data)
 
     def check(self) -> None:
         """Check that the file has a whole header, see :func:`check_has_header`."""
@@ -235,6 +233,11 @@ class StreamFile:
             return read_head(data, PREFIX.size) is not None
 
 
+def file_state(data: ByteSource) -> dict[str, int | bool]:
+    """The ``bytes`` of a stream's file, and whether it is ``complete``, that is, has its index."""
+    return {"bytes": len(data), "complete": footer_offset(data) is not None}
+
+
 def check_has_header(data: ByteSource, name: str) -> None:
     """Check that a stream has a whole header. Raises StreamError if it is empty, no stream, of another version, or
     truncated within its header."""
@@ -247,10 +250,7 @@ def check_has_header(data: ByteSource, name: str) -> None:
 
 
 def write_page(path: Path, stream: StreamFile) -> int:
-    """Writes one HTML page that contains the player and the stream at its present length.
-
-    Returns:
-        Bytes of the page.
+    """Writes one HTML page that contains the player and the stream at its present length; returns its bytes.
 
     Raises:
         PlayerError: the stream is too long for a page, or the installation lacks the player.
@@ -265,10 +265,8 @@ def write_page(path: Path, stream: StreamFile) -> int:
 
 
 def write_site(folder: Path, stream: StreamFile) -> int:
-    """Writes ``index.html``, ``player.js`` and ``stream.sgs`` into a folder; a web server needs nothing else.
-
-    Returns:
-        Bytes of the three files.
+    """Writes ``index.html``, ``player.js`` and ``stream.sgs`` into a folder; a web server needs nothing else. Returns
+    the bytes of the three files.
 
     Raises:
         PlayerError: the installation lacks the player.
@@ -286,10 +284,6 @@ def write_site(folder: Path, stream: StreamFile) -> int:
     for name, content in small.items():
         atomic_write(folder / name, content, new_folder=True)
     with stream.opened() as data:
-        atomic_write(copy, _pieces(data), new_folder=True)
+        pieces = (data[start : start + PIECE_BYTES] for start in range(0, len(data), PIECE_BYTES))
+        atomic_write(copy, pieces, new_folder=True)
         return sum(map(len, small.values())) + len(data)
-
-
-def _pieces(data: ByteSource) -> Iterator[bytes | memoryview]:
-    for start in range(0, len(data), PIECE_BYTES):
-        yield data[start : min(start + PIECE_BYTES, len(data))]

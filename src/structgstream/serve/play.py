@@ -9,7 +9,7 @@ to read it; and URLs name cameras and frames, never files.
 """
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 from starlette.applications import Starlette
@@ -84,14 +84,8 @@ class Truth:
 
 
 def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
-    """The application; each request opens the file anew, so it may grow meanwhile.
-
-    Args:
-        truth: the capture's pictures to compare with, or None.
-
-    Raises:
-        PlayerError: the installation lacks the player.
-    """
+    """The application; each request opens the file anew, so it may grow meanwhile. ``truth`` is the capture's pictures
+    to compare with. Raises PlayerError if the installation lacks the player."""
     module = bundle()
     page = linked_page(stream.path.name, stream="stream", attributes={"truth": "truth.json"} if truth else {})
     # A growing file may differ in each response, so responses are not cached and have no validators.
@@ -105,8 +99,7 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
         return Response(module, media_type="text/javascript", headers=headers)
 
     def state(request: Request) -> Response:
-        size_bytes, complete = stream.state()
-        return JSONResponse({"bytes": size_bytes, "complete": complete}, headers=headers)
+        return JSONResponse(stream.state(), headers=headers)
 
     def stream_bytes(request: Request) -> Response:
         return file_response(stream.opened(), request, headers)
@@ -121,11 +114,8 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
             return PlainTextResponse("There is no such camera or frame.", 404, headers)
         return Response(data, media_type="image/jpeg", headers=headers)
 
-    def no_stream(request: Request, error: Exception) -> Response:
-        return PlainTextResponse(str(error), 404, headers)
-
-    def no_picture(request: Request, error: Exception) -> Response:
-        return PlainTextResponse(str(error), 500, headers)
+    def refusing(status: int) -> Callable[[Request, Exception], Response]:
+        return lambda request, error: PlainTextResponse(str(error), status, headers)
 
     return Starlette(
         routes=[
@@ -137,5 +127,5 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
             Route("/truth/{camera:path}/{frame:int}.jpg", picture),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(LOOPBACK_NAMES), www_redirect=False)],
-        exception_handlers={StreamError: no_stream, CaptureError: no_picture},
+        exception_handlers={StreamError: refusing(404), CaptureError: refusing(500)},
     )

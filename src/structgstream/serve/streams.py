@@ -141,10 +141,8 @@ class Catalog:
     """The streams of a folder, listed again when the last listing is a second old.
 
     A folder of segments, or of renditions, is one stream: itself. A stream of another name than Note [Plain names] says
-    is left out, with a warning.
-
-    Raises:
-        PlayerError: it is no folder, cannot be read, or is itself a stream of such a name.
+    is left out, with a warning. Raises PlayerError if it is no folder, cannot be read, or is itself a stream of such a
+    name.
     """
 
     def __init__(self, folder: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -220,7 +218,6 @@ def _renditions(root: Path, name: str) -> list[str | None]:
 
 
 def _opens(root: Path, *parts: str) -> bool:
-    opened = open_below(root, *parts)
-    if opened is not None:
+    if (opened := open_below(root, *parts)) is not None:
         opened.close()
     return opened is not None

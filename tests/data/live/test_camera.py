@@ -6,11 +6,8 @@ Times of pictures from stamps that jump, repeat, go back, wrap, drift and come l
 
 import io
 import itertools
-import logging
 import socket
 import threading
-import time
-from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,12 +22,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed, ClockMapper, ClockResets, PictureTime
-from structgstream.data.live.rig_file import LiveCamera, TimeBase
-from structgstream.data.live.sound import LiveSound
+from structgstream.data.live.rig_file import LiveCamera, LiveRig, TimeBase
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
+from structgstream.data.sound import LiveSound
 from tests.support.properties import examples
 from tests.support.sender_modules import coded_film, moving_pictures, number_shown, sent_stream
+from tests.support.waiting import wait_until
 
 WAIT = 20.0
 PERIOD = 1 / 30
@@ -40,11 +38,11 @@ NOWHERE = LiveCamera("udp://nowhere")
 class Received:
     """Notes what a camera delivers."""
 
-    def __init__(self) -> None:
+    def __init__(self, changed_at: float = -np.inf) -> None:
         self.pictures: list[LivePicture] = []
         self.losses = 0
         self.waits: list[float] = []
-        self.changed_at = {"another": -float("inf")}
+        self.changed_at = {"another": changed_at}
 
     def add(self, camera: str, picture: LivePicture) -> None:
         self.pictures.append(picture)
@@ -70,50 +68,50 @@ def clock(base: TimeBase, *, offset_seconds: float = 0.0) -> ClockMapper:
 
 
 def camera_feed(
-    received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, **opening: Any
+    received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, tick: float = PERIOD / 2, **options: Any
 ) -> tuple[CameraFeed, FaultLog]:
-    """A camera of 128x96 pixels in a time of its own, and its faults."""
+    """A camera of 128x96 pixels in a time of its own, ``tick`` seconds later each time it is read, and its faults."""
     ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
     feed = CameraFeed(
         "a",
-        camera,
+        LiveRig("rig", Path(), {"a": camera}, clock=base, stuck_seconds=1.0),
         size=(128, 96),
         synchronizer=received,  # type: ignore[arg-type]
         changed_at=received.changed_at,
-        clock=clock(base),
+        resets=ClockResets(),
         faults=faults,
-        now=lambda: next(ticks) * PERIOD / 2,
+        now=lambda: next(ticks) * tick,
         unix_offset=1000.0,
-        silent_seconds=5.0,
-        stuck_seconds=1.0,
-        **opening,
+        **options,
     )
     return feed, faults
 
 
 def read(
-    *streams: bytes | Exception, base: TimeBase = TimeBase.STREAM, received: Received | None = None
+    *streams: bytes | Exception,
+    base: TimeBase = TimeBase.STREAM,
+    form: str | None = None,
+    changed_at: float = -np.inf,
+    **options: Any,
 ) -> tuple[Received, dict[str, int]]:
-    """What a camera delivers that is opened for each of ``streams``, and its faults."""
-    received = Received() if received is None else received
-    waiting = list(streams)
-    waits: list[float] = []
+    """What a camera delivers that is opened for each of ``streams``, and its faults; another one last changed at
+    ``changed_at``."""
+    received, waiting = Received(changed_at), list(streams)
 
     def opens(camera: LiveCamera, timeout: float) -> Any:
         stream = waiting.pop(0)
         if isinstance(stream, Exception):
             raise stream
-        return closing(av.open(io.BytesIO(stream)))
+        return av.open(io.BytesIO(stream), format=form)
 
     def wait(seconds: float) -> None:
-        waits.append(seconds)
+        received.waits.append(seconds)
         if not waiting:
             feed.stop()
 
-    feed, faults = camera_feed(received, base=base, open_camera=opens, wait=wait)
+    feed, faults = camera_feed(received, base=base, open_camera=opens, wait=wait, **options)
     feed.start()
     feed.join(WAIT)
-    received.waits = waits
     return received, faults.counts.get("a", {})
 
 
@@ -132,8 +130,7 @@ def test_a_stream_that_is_joined_late_begins_with_a_key_frame_and_tells_nothing(
 
 
 def test_of_garbage_nothing_is_delivered_until_the_next_key_frame(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        received, faults = read(sent_stream("garbage:0.5:0.2"))
+    received, faults = read(sent_stream("garbage:0.5:0.2"))
     lost = set(range(60)) - {round((p.seconds - 1000) / PERIOD) for p in received.pictures}
     assert set(range(15, 21)) <= lost <= set(range(14, 25))  # up to the key frame 24
     assert received.numbers == [n % 12 for n in range(60) if n not in lost]
@@ -180,18 +177,10 @@ def with_b_frames(x264: str, first: int = 0) -> bytes:
 @pytest.mark.parametrize("x264", ["bframes=0", "bframes=3", "bframes=3:open-gop=1"])
 def test_what_is_recorded_after_a_loss_begins_with_a_key_frame(x264: str, base: TimeBase) -> None:
     """Decoders give pictures back some packets later, where B-frames refer to pictures after them."""
-    stream, packets, received = with_b_frames(x264), Packets(), Received()
+    stream, packets = with_b_frames(x264), Packets()
     middle = len(stream) // 3 // 188 * 188
-    waiting = [stream[:middle] + stream[middle + 188 * 3 :], with_b_frames(x264, first=240)]
-    feed, _ = camera_feed(
-        received,
-        base=base,
-        open_camera=lambda camera, timeout: closing(av.open(io.BytesIO(waiting.pop(0)))),
-        wait=lambda seconds: None if waiting else feed.stop(),
-        recorder=packets,
-    )
-    feed.start()
-    feed.join(WAIT)
+    cut = stream[:middle] + stream[middle + 188 * 3 :]
+    received, _ = read(cut, with_b_frames(x264, first=240), base=base, recorder=packets)
     recorded = packets.shown()
     assert 90 < len(recorded.pictures) <= len(received.pictures) < 120
     if base is TimeBase.STREAM:
@@ -213,8 +202,7 @@ def test_what_is_recorded_after_a_loss_begins_with_a_key_frame(x264: str, base: 
 def test_a_picture_of_other_proportions_is_left_out_and_a_reduced_one_is_taken(
     fault: str, taken: set[tuple[int, int]], said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level(logging.WARNING):
-        received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
+    received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
     assert {(p.content.width, p.content.height) for p in received.pictures} == taken
     assert faults["other size"] == 12
     assert said in caplog.text
@@ -222,9 +210,7 @@ def test_a_picture_of_other_proportions_is_left_out_and_a_reduced_one_is_taken(
 
 @pytest.mark.parametrize("still", [True, False])
 def test_a_picture_that_stands_still_is_left_out_if_others_change(still: bool) -> None:
-    received = Received()
-    received.changed_at["another"] = -float("inf") if still else 1e9
-    received, faults = read(sent_stream("stuck:0.4:1.2"), received=received)
+    received, faults = read(sent_stream("stuck:0.4:1.2"), changed_at=-np.inf if still else 1e9)
     if still:
         assert "stuck" not in faults
         assert len(received.pictures) >= 57  # another muxer's first packets do not follow the ones before
@@ -237,8 +223,7 @@ def test_a_picture_that_stands_still_is_left_out_if_others_change(still: bool) -
 
 @pytest.mark.parametrize("fault", ["jump", "back"])
 def test_a_clock_that_is_set_is_reported_and_the_pictures_go_on(fault: str, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
+    received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
     assert faults["jump"] == 2
     assert len(received.pictures) == 60
     times = [p.seconds for p in received.pictures]
@@ -248,18 +233,9 @@ def test_a_clock_that_is_set_is_reported_and_the_pictures_go_on(fault: str, capl
 
 def test_sound_with_the_stamps_of_a_clock_that_pictures_do_not_have_yet_is_left_out() -> None:
     """A camera sets its clock by an hour, and sound is the first to have it; later sound is heard all the same."""
-    sound, received = LiveSound("a"), Received()
+    sound = LiveSound("a")
     feed = sound.open()
-    ended = threading.Event()
-    camera, _ = camera_feed(
-        received,
-        base=TimeBase.STREAM,
-        open_camera=lambda camera, timeout: closing(av.open(io.BytesIO(with_hasty_sound(sent_stream())))),
-        wait=lambda seconds: (camera.stop(), ended.set()),
-        sound=sound,
-    )
-    camera.start()
-    assert ended.wait(WAIT)
+    received, _ = read(with_hasty_sound(sent_stream()), sound=sound)
     sound.synchronize(received.pictures[0].seconds)
     times = [packet.seconds for packet in feed.until(3600.0)]
     assert times[-1] == pytest.approx(1.9, abs=0.2)
@@ -269,6 +245,8 @@ def test_sound_with_the_stamps_of_a_clock_that_pictures_do_not_have_yet_is_left_
 def with_hasty_sound(video: bytes) -> bytes:
     """The same MPEG-TS with sound; the stamps are an hour later from 1 s on, those of sound from 0.9 s on."""
     output = io.BytesIO()
+    container: Any
+    given: Any
     with av.open(io.BytesIO(video)) as given, av.open(output, "w", format="mpegts") as container:
         pictures = container.add_stream_from_template(given.streams.video[0])
         stream = container.add_stream("aac", rate=48_000, layout="mono")
@@ -306,8 +284,7 @@ def test_stamps_that_go_back_are_left_out() -> None:
 def test_a_camera_that_ends_or_cannot_be_opened_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
     refused = ConnectionRefusedError(111, "Connection refused")
     streams = [sent_stream(frames=24), *[refused] * 6, sent_stream(frames=24, begun=1000.8)]
-    with caplog.at_level(logging.WARNING):
-        received, faults = read(*streams)
+    received, faults = read(*streams)
     assert faults == {"gone": 8}
     assert received.numbers == [n % 12 for n in range(24)] * 2
     assert received.steps == [1] * 47
@@ -317,8 +294,7 @@ def test_a_camera_that_ends_or_cannot_be_opened_is_opened_again(caplog: pytest.L
 
 
 def test_an_error_of_the_network_is_reported_in_words(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        read(av.error.ExitError(1414092869, "Immediate exit requested", "udp://nowhere"))
+    read(av.error.ExitError(1414092869, "Immediate exit requested", "udp://nowhere"))
     assert "is gone (nothing came for 5 s)" in caplog.text
 
 
@@ -342,8 +318,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
     """The first ones of a connection wait for stamps; a camera that has none is timed by arrival, if that is asked."""
     feed, faults = camera_feed(Received(), base=base)
     frames = [SimpleNamespace(pts=None, time_base=None)] * 60
-    with caplog.at_level(logging.WARNING):
-        placed = [feed._common_time(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
+    placed = [feed._common_time(frame, n * PERIOD) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
     assert placed[:MAX_UNSTAMPED] == [None] * MAX_UNSTAMPED
     assert faults.counts["a"] == {"no stamp": 60}
     if base is TimeBase.ARRIVAL:
@@ -353,7 +328,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert placed == [None] * 60
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
-    assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+    assert feed._common_time(stamped, 61 * PERIOD) is not None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -379,8 +354,7 @@ def test_interlaced_and_turned_pictures_are_left_out_as_recordings_refuse_or_tur
         for picture in moving_pictures():
             output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         output.mux(stream.encode(None))
-    with caplog.at_level(logging.WARNING):
-        received, faults = read(written.getvalue())
+    received, faults = read(written.getvalue())
     assert len(received.pictures) == (12 if said is None else 0)
     assert faults.get("other size", 0) == (0 if said is None else 12)
     assert said is None or said in caplog.text
@@ -395,21 +369,11 @@ def test_pictures_of_formats_without_stamps_are_taken_when_they_arrive(
     form: str, codec: str, options: dict[str, str], base: TimeBase
 ) -> None:
     """As web cameras send them, here five a second: what FFmpeg counts for them at 25 a second is no clock."""
-    received, packets, ticks = Received(), Packets(), itertools.count()
-    sent = coded_film(codec, range(60), form=form, **options)
-    feed, faults = camera_feed(
-        received,
-        base=base,
-        recorder=packets,
-        open_camera=lambda *_: closing(av.open(io.BytesIO(sent), format=form)),
-        wait=lambda _: feed.stop(),
-    )
-    feed._now = lambda: next(ticks) * 0.1
-    feed.start()
-    feed.join(WAIT)
+    sent, packets = coded_film(codec, range(60), form=form, **options), Packets()
+    received, faults = read(sent, base=base, form=form, tick=0.1, recorder=packets)
     if base is not TimeBase.ARRIVAL:
         assert not received.pictures
-        assert faults.counts["a"]["no stamp"] >= 55
+        assert faults["no stamp"] >= 55
         return
     assert len(received.pictures) >= 55
     assert np.ptp([one.seconds - one.arrived for one in received.pictures]) < 0.5
@@ -421,10 +385,9 @@ def test_pictures_of_formats_without_stamps_are_taken_when_they_arrive(
 def test_stamps_that_are_no_unix_time_are_told(stamp: float, caplog: pytest.LogCaptureFixture) -> None:
     """As those of most containers, which begin with 0."""
     feed, _ = camera_feed(Received(), base=TimeBase.UNIX)
-    with caplog.at_level(logging.WARNING):
-        for number in range(3):
-            frame: Any = SimpleNamespace(pts=stamp + number, time_base=1)
-            assert feed._common_time(frame, 1.7e9 - 1000.0 + number, None) == stamp + number
+    for number in range(3):
+        frame: Any = SimpleNamespace(pts=stamp + number, time_base=1)
+        assert feed._common_time(frame, 1.7e9 - 1000.0 + number) == stamp + number
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == (0 if stamp == 1.7e9 else 1)
     assert all("sends time stamps 1699999000 s from the Unix time of this machine; set the" in text for text in said)
@@ -462,9 +425,7 @@ def test_a_camera_that_sends_rtp(tmp_path: Path, form: str) -> None:
     sender.start()
     feed.start()
     try:
-        last = time.monotonic() + WAIT
-        while len(received.pictures) < 8 and time.monotonic() < last:
-            time.sleep(0.05)
+        wait_until(lambda: len(received.pictures) >= 8)
     finally:
         ended.set()
         feed.stop()
@@ -480,12 +441,16 @@ UNIX = 1_700_000_000.0
 WRAP = 2**33 / 90_000
 
 
+def mapped(mapper: ClockMapper, stamps, arrivals, **options) -> list[PictureTime]:
+    return [mapper.map(stamp, arrived=at, **options) for stamp, at in zip(stamps, arrivals, strict=True)]
+
+
 def placed(mapper: ClockMapper, stamps, arrivals, **options) -> list[Any]:
-    return [mapper.map(stamp, arrived=at, **options).seconds for stamp, at in zip(stamps, arrivals, strict=True)]
+    return [found.seconds for found in mapped(mapper, stamps, arrivals, **options)]
 
 
-def seconds_of(found: list[PictureTime]) -> np.ndarray:
-    return np.array([item.seconds for item in found], np.float64)
+def steps(found: list[PictureTime]) -> np.ndarray:
+    return np.diff(np.array([item.seconds for item in found], np.float64))
 
 
 def test_arrival_keeps_the_spacing_of_the_stamps_in_spite_of_jitter() -> None:
@@ -506,10 +471,9 @@ def test_pictures_that_were_held_back_are_no_jump() -> None:
     arrivals = np.maximum(UNIX + stamps, UNIX + np.where((stamps > 3) & (stamps < 7), 7, 0))
     arrivals = np.maximum.accumulate(arrivals + 1e-4 * np.arange(300))
     for base in (TimeBase.ARRIVAL, TimeBase.STREAM):
-        mapper = clock(base)
-        found = [mapper.map(stamp, arrived=at) for stamp, at in zip(stamps, arrivals, strict=True)]
+        found = mapped(clock(base), stamps, arrivals)
         assert [item.fault for item in found] == [None] * 300
-        assert np.allclose(np.diff(seconds_of(found)), PERIOD, atol=2e-4)
+        assert np.allclose(steps(found), PERIOD, atol=2e-4)
 
 
 def test_a_clock_that_runs_fast_is_followed_by_arrival() -> None:
@@ -528,13 +492,12 @@ def test_stream_takes_stamps_and_offsets() -> None:
 def test_after_a_jump_pictures_go_on_as_late_as_before(base: TimeBase, jump: float) -> None:
     mapper = clock(base)
     before, after = np.arange(90) * PERIOD, np.arange(90, 180) * PERIOD
-    start = placed(mapper, before, UNIX + before + 0.03)
+    start = mapped(mapper, before, UNIX + before + 0.03)
     found = mapper.map(after[0] + jump, arrived=UNIX + after[0] + 0.034)
     assert found.fault is Fault.JUMP
     assert found.reset_seconds == pytest.approx(jump, abs=0.005)
-    rest = placed(mapper, after[1:] + jump, UNIX + after[1:] + 0.03)
-    steps = np.diff(np.array([*start, found.seconds, *rest], np.float64))
-    assert np.abs(steps - PERIOD).max() < 0.005
+    rest = mapped(mapper, after[1:] + jump, UNIX + after[1:] + 0.03)
+    assert np.abs(steps([*start, found, *rest]) - PERIOD).max() < 0.005
 
 
 def test_cameras_whose_common_clock_is_set_stay_in_step_exactly() -> None:
@@ -558,29 +521,27 @@ def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float)
     mapper = clock(base)
     placed(mapper, np.arange(91) * PERIOD, UNIX + np.arange(91) * PERIOD)
     mapper.reconnect()
-    found = [mapper.map(stamp + t, arrived=UNIX + 10 + t) for t in np.arange(30) * PERIOD]
+    times = np.arange(30) * PERIOD
+    found = mapped(mapper, stamp + times, UNIX + 10 + times)
     assert {item.fault for item in found} == {None}
     if base is TimeBase.ARRIVAL or stamp != 3.0:
-        assert np.allclose(np.diff(seconds_of(found)), PERIOD, atol=1e-5)
+        assert np.allclose(steps(found), PERIOD, atol=1e-5)
     if base is TimeBase.ARRIVAL:
         assert found[0].seconds == pytest.approx(UNIX + 10, abs=1e-3)
 
 
 def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
-    mapper = clock(TimeBase.STREAM)
-    stamps = [0.0, 0.1, 0.1, 0.3, 0.2, 0.4]
-    found = [mapper.map(stamp, arrived=UNIX + 0.1 * n) for n, stamp in enumerate(stamps)]
+    found = mapped(clock(TimeBase.STREAM), [0.0, 0.1, 0.1, 0.3, 0.2, 0.4], UNIX + 0.1 * np.arange(6))
     assert [item.fault for item in found] == [None, None, Fault.DUPLICATE, None, Fault.REORDERED, None]
     assert [item.seconds for item in found] == [0.0, 0.1, None, 0.3, None, 0.4]
 
 
 @pytest.mark.parametrize("base", TimeBase)
 def test_stamps_of_33_bits_wrap(base: TimeBase) -> None:
-    mapper = clock(base)
     true = WRAP - 1 + np.arange(60) * PERIOD
-    found = [mapper.map(t % WRAP, arrived=UNIX + t, wrap_seconds=WRAP) for t in true]
+    found = mapped(clock(base), true % WRAP, UNIX + true, wrap_seconds=WRAP)
     assert {item.fault for item in found} == {None}
-    assert np.allclose(np.diff(seconds_of(found)), PERIOD)
+    assert np.allclose(steps(found), PERIOD)
 
 
 def test_unix_stamps_are_found_again_from_33_bits() -> None:

@@ -3,7 +3,6 @@
 
 import re
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from structgstream.data.live.ingest import Ingest
 from structgstream.data.live.rig_file import LiveCamera, LiveRig
 from structgstream.data.live.status import FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
+from tests.support.waiting import wait_until
 
 SIZE = (64, 48)
 PERIOD = 1 / 30
@@ -40,10 +40,7 @@ class Bench:
         return self
 
     def wait(self, sets: int) -> None:
-        last = time.monotonic() + 20.0
-        while self.ingest.sets < sets:
-            assert time.monotonic() < last
-            time.sleep(0.005)
+        wait_until(lambda: self.ingest.sets >= sets)
 
 
 def test_the_newest_set_is_taken_and_the_others_are_counted() -> None:
@@ -90,10 +87,7 @@ def test_an_error_of_the_synchronizer_reaches_the_trainer(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(FrameSynchronizer, "next_set", fails)
     bench = Bench("a").running()
-    last = time.monotonic() + 20.0
-    while bench.ingest._failure is None:
-        assert time.monotonic() < last
-        time.sleep(0.005)
+    wait_until(lambda: bench.ingest._failure is not None)
     with pytest.raises(OSError, match="the disk is gone"):
         _ = bench.ingest.end_reason
 

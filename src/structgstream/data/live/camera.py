@@ -17,11 +17,10 @@ delay allows. Pictures that a network delayed come late, never early, so they do
 """
 
 import logging
-import math
 import threading
 import zlib
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
@@ -29,10 +28,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from structgstream.data.live.recorder import CameraRecorder
-from structgstream.data.live.rig_file import LiveCamera, TimeBase
-from structgstream.data.live.sound import LiveSound
+from structgstream.data.live.rig_file import LiveCamera, LiveRig, TimeBase
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture
+from structgstream.data.sound import LiveSound
 from structgstream.data.video_index import TURNS, display_matrix, load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
@@ -41,11 +40,25 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.frame import VideoFrame
 
+log = logging.getLogger(__name__)
 
 RESET_SECONDS = 1.0
 WINDOW_SECONDS = 15.0
 DUPLICATE_SECONDS = 1e-6
 SAME_RESET_SECONDS = 0.1
+FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
+MPEGTS_WRAP_SECONDS = 2**33 / 90_000
+MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
+MAX_SOUND_APART_SECONDS = 10.0
+"""Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
+FAR_SECONDS = 60.0  # of Unix time by stamps from that of this machine, before it is reported
+MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
+SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
+ENDED = "it ended"
+ARRIVAL_TICK = Fraction(1, 1_000_000)
+NO_TIMESTAMPS = 0x80
+"""FFmpeg's flag of formats without time stamps (AVFMT_NOTIMESTAMPS)."""
+PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
 @dataclass(frozen=True)
@@ -115,8 +128,7 @@ class ClockMapper:
     @property
     def shift(self) -> float:
         """What is added to a stamp as it comes, to get the time on the common clock; seconds."""
-        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
-        return self._wrapped + shift + self._offset
+        return self._wrapped + self._shift + self._offset
 
     def reconnect(self) -> None:
         """The next picture is the first of a new connection, whose stamps may start again without a fault."""
@@ -162,42 +174,25 @@ class ClockMapper:
 
     def _mapped(self, stamp: float) -> PictureTime:
         self._stamp = stamp
-        shift = self._delay.value if self.base is TimeBase.ARRIVAL else self._shift
-        seconds = stamp + shift + self._offset
+        if self.base is TimeBase.ARRIVAL:
+            self._shift = self._delay.value
+        seconds = stamp + self._shift + self._offset
         if seconds <= self._seconds:
             return PictureTime(None, Fault.REORDERED)
         self._seconds = seconds
         return PictureTime(seconds)
 
 
-log = logging.getLogger(__name__)
-
-FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
-MPEGTS_STAMPS = 2**33
-MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
-MAX_SOUND_APART_SECONDS = 10.0
-"""Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
-FAR_SECONDS = 60.0  # of Unix time by stamps from that of this machine, before it is reported
-MAX_HELD = 64  # packets; decoders of H.264 and HEVC hold back 16 pictures, of up to two packets each
-SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
-ENDED = "it ended"
-ARRIVAL_TICK = Fraction(1, 1_000_000)
-NO_TIMESTAMPS = 0x80
-"""FFmpeg's flag of formats without time stamps (AVFMT_NOTIMESTAMPS)."""
-PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
-
-
 def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
     """The opened camera."""
-    options = {**PROBE_OPTIONS, **camera.options}
+    # Without a list FFmpeg opens nothing but files from a file.
+    session = {"protocol_whitelist": "file,udp,rtp"} if camera.is_session else {}
+    options = {**PROBE_OPTIONS, **session, **camera.options}
     if camera.follow:
         options["follow"] = "1"
-    if camera.is_session:
-        # Without this FFmpeg opens nothing but files from a file.
-        options.setdefault("protocol_whitelist", "file,udp,rtp")
     # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
     timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
-    return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))
+    return load_av().open(camera.url, format=camera.format, options=options, timeout=timeout)
 
 
 class CameraFeed:
@@ -207,8 +202,7 @@ class CameraFeed:
         size: width and height of the calibration's pictures.
         changed_at: by camera, when its picture last changed, monotonic seconds; shared by all feeds.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
-        silent_seconds: without packets for this time, the camera is opened again.
-        stuck_seconds: a picture that does not change for this time is not used if others change.
+        resets: shared by all feeds.
         open_camera: opens a camera with a timeout in seconds.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
         sound: receives the camera's sound; None where that is not wanted.
@@ -217,27 +211,24 @@ class CameraFeed:
     def __init__(
         self,
         name: str,
-        camera: LiveCamera,
+        rig: LiveRig,
         *,
         size: tuple[int, int],
         synchronizer: FrameSynchronizer,
         changed_at: dict[str, float],
-        clock: ClockMapper,
+        resets: ClockResets,
         faults: FaultLog,
         now: Callable[[], float],
         unix_offset: float,
-        silent_seconds: float,
-        stuck_seconds: float,
         recorder: CameraRecorder | None = None,
         open_camera: Callable[[LiveCamera, float], AbstractContextManager[Any]] = open_with_pyav,
         wait: Callable[[float], object] | None = None,
         sound: LiveSound | None = None,
     ) -> None:
-        self.name, self._camera, self._size = name, camera, size
-        self._synchronizer, self._changed_at = synchronizer, changed_at
-        self._clock, self._faults = clock, faults
+        self.name, self._rig, self._camera, self._size = name, rig, rig.cameras[name], size
+        self._clock = ClockMapper(rig.clock, resets=resets, offset_seconds=self._camera.offset_seconds)
+        self._synchronizer, self._changed_at, self._faults = synchronizer, changed_at, faults
         self._now, self._unix_offset = now, unix_offset
-        self._silent, self._stuck = silent_seconds, stuck_seconds
         self._recorder, self._sound, self._open_camera = recorder, sound, open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
@@ -251,6 +242,7 @@ class CameraFeed:
         self._gone_since: float | None = None
         self._paced: float | None = None
         self._unstamped = 0
+        self._wrap_seconds: float | None = None  # after which stamps of the container begin again
         self._stamp: float | None = None  # of the last picture, as it came
         self._usable = True
         self.ended = False
@@ -286,10 +278,10 @@ class CameraFeed:
         """Reads until the connection ends; why it did."""
         av = load_av()
         try:
-            with self._open_camera(self._camera, self._silent) as container:
+            with self._open_camera(self._camera, self._rig.silent_seconds) as container:
                 self._read(container)
         except av.error.ExitError:
-            return f"nothing came for {self._silent:g} s"
+            return f"nothing came for {self._rig.silent_seconds:g} s"
         except (av.error.FFmpegError, OSError, ValueError) as error:
             return str(getattr(error, "strerror", None) or error)
         except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
@@ -306,7 +298,7 @@ class CameraFeed:
             raise ValueError("its coding is unknown to the installed PyAV")
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
         self._clock.reconnect()
-        ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
+        self._wrap_seconds = MPEGTS_WRAP_SECONDS if container.format.name == "mpegts" else None
         stamped = self._camera.is_file or not container.format.flags & NO_TIMESTAMPS
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before, self._held, self._whole = None, [], False
@@ -322,8 +314,7 @@ class CameraFeed:
                 self._stamp_arrival(packet)
             self._hold(packet)
             for frame in self._frames(packet):
-                wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
-                self._record(frame, shift_seconds=self._picture(frame, wrap))
+                self._record(frame, shift_seconds=self._picture(frame))
 
     def _stamp_arrival(self, packet: "Packet") -> None:
         """Stamps a packet of a format without stamps by its arrival: FFmpeg counts pictures at 25 a second, or leaves
@@ -372,7 +363,7 @@ class CameraFeed:
             for frame in cast("list[AudioFrame]", packet.decode()):
                 if frame.time is None or self._stamp is None or not self._decodes:
                     continue
-                if math.isfinite(self._clock.shift) and abs(frame.time - self._stamp) < MAX_SOUND_APART_SECONDS:
+                if abs(frame.time - self._stamp) < MAX_SOUND_APART_SECONDS:
                     self._sound.add(frame, frame.time + self._clock.shift)
         except (load_av().error.FFmpegError, ValueError) as error:  # The pictures go on.
             self._faults.warn(self.name, "sound", f"sends sound that cannot be decoded ({error}); it is left out")
@@ -413,19 +404,22 @@ class CameraFeed:
     def _report_damage(self, reason: str, *, picture: int | None = None) -> None:
         self._damaged = True
         self._forget(picture)
-        if not self._decodes:
-            return
-        self._synchronizer.mark_absent(self.name)
-        text = f"sends what cannot be decoded ({reason}); it is absent until its next key frame"
-        self._faults.report(self.name, Fault.GARBAGE, text)
+        if self._decodes:
+            text = f"sends what cannot be decoded ({reason}); it is absent until its next key frame"
+            self._report_absent(Fault.GARBAGE, text)
 
-    def _picture(self, frame: "VideoFrame", wrap_seconds: float | None) -> float:
+    def _report_absent(self, fault: Fault, text: str) -> None:
+        """Reports a fault that makes the camera absent."""
+        self._synchronizer.mark_absent(self.name)
+        self._faults.report(self.name, fault, text)
+
+    def _picture(self, frame: "VideoFrame") -> float:
         """Delivers a decoded frame unless something is wrong with it; the shift from its stamp to the common clock."""
         self._pace(frame)
         arrived = self._now()
         self.decoded += 1
         self._report_back(arrived)
-        seconds = self._common_time(frame, arrived, wrap_seconds)
+        seconds = self._common_time(frame, arrived)
         self._usable = self._has_calibrated_shape(frame)
         if seconds is not None and self._usable and not self._is_frozen(frame, arrived):
             self._synchronizer.add(self.name, LivePicture(seconds, arrived, frame))
@@ -439,13 +433,14 @@ class CameraFeed:
             self._paced = self._now() - frame.time
         self._stop.wait(max(self._paced + frame.time - self._now(), 0.0))
 
-    def _common_time(self, frame: "VideoFrame", arrived: float, wrap_seconds: float | None) -> float | None:
+    def _common_time(self, frame: "VideoFrame", arrived: float) -> float | None:
         """When the picture was taken, on the common clock; None if it must not be used."""
         unix = arrived + self._unix_offset
         if frame.pts is None or frame.time_base is None:
             stamp, wrap_seconds = self._substitute_stamp(unix), None
         else:
-            stamp, self._unstamped = float(frame.pts * frame.time_base), 0
+            stamp, wrap_seconds = float(frame.pts * frame.time_base), self._wrap_seconds
+            self._unstamped = 0
         if stamp is None:
             return None
         self._stamp = stamp
@@ -479,21 +474,20 @@ class CameraFeed:
     def _has_calibrated_shape(self, frame: "VideoFrame") -> bool:
         """Whether the picture has the proportions of the calibration, at any size, and is stored as it is shown."""
         width, height = self._size
-        alike = abs(frame.width * height - width * frame.height) <= max(width, height)
         until = "it is absent until that is mended"
+        sizes = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}"
         if frame.interlaced_frame:
-            alike, text = False, f"sends interlaced pictures, whose lines are of two instants; {until}"
+            text = f"sends interlaced pictures, whose lines are of two instants; {until}"
         elif TURNS.get(display_matrix(frame)) != 0:
-            alike, text = False, f"sends pictures that are turned or mirrored to be shown; {until}"
-        elif (frame.width, frame.height) == (width, height):
-            return True
+            text = f"sends pictures that are turned or mirrored to be shown; {until}"
+        elif abs(frame.width * height - width * frame.height) > max(width, height):
+            text = f"{sizes}; {until}, because what is cut off is unknown"
         else:
-            what = "it is resampled" if alike else f"{until}, because what is cut off is unknown"
-            text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
-        self._faults.report(self.name, Fault.OTHER_SIZE, text)
-        if not alike:
-            self._synchronizer.mark_absent(self.name)
-        return alike
+            if (frame.width, frame.height) != (width, height):
+                self._faults.report(self.name, Fault.OTHER_SIZE, f"{sizes}; it is resampled")
+            return True
+        self._report_absent(Fault.OTHER_SIZE, text)
+        return False
 
     def _is_frozen(self, frame: "VideoFrame", arrived: float) -> bool:
         """Whether the picture has not changed for a long time while those of other cameras did."""
@@ -503,16 +497,14 @@ class CameraFeed:
             return False
         changed_at = self._changed_at[self.name]
         others = (seconds for name, seconds in self._changed_at.items() if name != self.name)
-        if max(others, default=changed_at) - changed_at < self._stuck:
+        if max(others, default=changed_at) - changed_at < self._rig.stuck_seconds:
             return False
         text = f"has sent the same picture for {arrived - changed_at:.1f} s; it is absent until that changes"
-        self._faults.report(self.name, Fault.STUCK, text)
-        self._synchronizer.mark_absent(self.name)
+        self._report_absent(Fault.STUCK, text)
         return True
 
     def _report_end(self, reason: str) -> None:
         """A file was read to its end, or cannot be read."""
-        self._synchronizer.mark_absent(self.name)
         if self.decoded:
             how = "" if reason is ENDED else f" ({reason})"
             text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"
@@ -521,15 +513,14 @@ class CameraFeed:
                 f"is absent, because its file {self._camera.shown_url} cannot be read ({reason}); correct its url in "
                 "the rig file, or give follow = true if the file is still to be written"
             )
-        self._faults.report(self.name, Fault.GONE, text)
+        self._report_absent(Fault.GONE, text)
         self.ended = True
 
     def _report_gone(self, reason: str) -> None:
         if self._gone_since is None:
             self._gone_since = self._now()
-        self._synchronizer.mark_absent(self.name)
         text = f"at {self._camera.shown_url} is gone ({reason}); it is absent, and is opened again until it is back"
-        self._faults.report(self.name, Fault.GONE, text)
+        self._report_absent(Fault.GONE, text)
 
     def _report_back(self, arrived: float) -> None:
         if self._gone_since is not None:

@@ -4,12 +4,12 @@
 import threading
 from collections.abc import Callable, Mapping
 
-from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets
+from structgstream.data.live.camera import CameraFeed, ClockResets
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
-from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, PictureSet
+from structgstream.data.sound import LiveSound
 
 TICK_SECONDS = 0.02
 MAX_MISSED_SETS = 30  # before a camera is reported as out of step
@@ -59,20 +59,18 @@ class Ingest:
         self.feeds = {
             name: CameraFeed(
                 name,
-                camera,
+                rig,
                 size=sizes[name],
                 synchronizer=self._synchronizer,
                 changed_at=changed_at,
-                clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
+                resets=resets,
                 faults=faults,
                 now=now,
                 unix_offset=unix_offset,
-                silent_seconds=rig.silent_seconds,
-                stuck_seconds=rig.stuck_seconds,
                 recorder=None if recording is None else recording.camera(name, faults),
                 sound=sound if sound is not None and sound.name == name else None,
             )
-            for name, camera in rig.cameras.items()
+            for name in rig.cameras
         }
         self._thread = threading.Thread(target=self._synchronize, name="synchronizer", daemon=True)
 
@@ -115,11 +113,7 @@ class Ingest:
 
     @property
     def end_reason(self) -> str | None:
-        """Why no more pictures will arrive; None while they may.
-
-        Raises:
-            BaseException: what ended the synchroniser's thread.
-        """
+        """Why no more pictures will arrive; None while they may. Raises what ended the synchroniser's thread."""
         if self._failure is not None:
             raise self._failure
         if self._newest is not None:
@@ -156,15 +150,11 @@ class Ingest:
             self._failure = error
 
     def _warn_out_of_step(self, cameras: Mapping[str, float]) -> None:
+        late = "either they come late, which a longer deadline_seconds or a less busy machine mends, or its clock is"
         for name, seconds in cameras.items():
-            if seconds < 0:
-                why = (
-                    f"are {-seconds:.3f} s behind those of the others: either they come late, which a longer "
-                    "deadline_seconds or a less busy machine mends, or its clock is"
-                )
-            else:
-                why = f"are {seconds:.3f} s ahead of those of the others: its clock is"
+            side, cause = ("behind", late) if seconds < 0 else ("ahead of", "its clock is")
             text = (
-                f"is absent, because its pictures {why}, which offset_seconds = {-seconds:+.3f} in the rig file mends"
+                f"is absent, because its pictures are {abs(seconds):.3f} s {side} those of the others: {cause}, which "
+                f"offset_seconds = {-seconds:+.3f} in the rig file mends"
             )
             self._faults.warn(name, Fault.UNMATCHED.value, text)

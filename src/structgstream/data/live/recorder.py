@@ -18,8 +18,8 @@ import logging
 import re
 import threading
 from bisect import bisect_right
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -50,14 +50,9 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
 
 class Recording:
-    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part.
-
-    Args:
-        masks: folder of masks of the calibration; those for all frames are copied.
-
-    Raises:
-        StorageError: it cannot be written, here or later.
-    """
+    """The folder of a recording, which is made; if it is not empty, the recording goes to its next part. Of ``masks``,
+    the folder of masks of the calibration, those for all frames are copied. Raises StorageError if it cannot be
+    written, here or later."""
 
     def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, masks: Path) -> None:
         self._folder, self._calibration, self._fps, self._masks = folder, calibration, fps, masks
@@ -96,7 +91,7 @@ class Recording:
             number = self.part_at(common_seconds)
             if number == part == len(self._starts) - 1:
                 self._starts.append(common_seconds)
-                return number + 1
+                number += 1
             return number if number > part else None
 
     def folder(self, number: int, files: Mapping[str, tuple[str, Clock]]) -> Path:
@@ -105,7 +100,7 @@ class Recording:
         with self._lock:
             if number not in self._folders:
                 # Looked up only now: another recording in the folder may have begun further parts meanwhile.
-                folder = _part(self._folder, _next_part(self._folder))
+                folder = _next_part(self._folder)
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                 except OSError as error:
@@ -188,25 +183,24 @@ class CameraRecorder:
         if packet.pts is None or packet.time_base is None:
             self._faults.warn(self._name, "recording", "sends packets without time stamps, which are not recorded")
             return
-        try:
-            with self._lock:
-                self._record(packet, shift_seconds)
-        except (load_av().error.FFmpegError, OSError, ValueError, StorageError) as error:
-            self._failed = True
-            self._report(error)
-
-    def _report(self, error: Exception) -> None:
-        reason = getattr(error, "strerror", None) or error
-        self._faults.warn(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
+        with self._ending_on_error():
+            self._record(packet, shift_seconds)
 
     def close(self) -> None:
         """Closes the file."""
-        with self._lock:
-            try:
-                self._close()
-            except (load_av().error.FFmpegError, OSError, ValueError) as error:
-                self._report(error)
+        with self._ending_on_error():
+            self._close()
+        self._failed = True
+
+    @contextmanager
+    def _ending_on_error(self) -> Iterator[None]:
+        try:
+            with self._lock:
+                yield
+        except (load_av().error.FFmpegError, OSError, ValueError, StorageError) as error:
             self._failed = True
+            reason = getattr(error, "strerror", None) or error
+            self._faults.warn(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
 
     def _record(self, packet: "Packet", shift_seconds: float) -> None:
         assert packet.pts is not None
@@ -262,15 +256,13 @@ def _codec(stream: Any) -> tuple[object, ...]:
     return context.name, context.width, context.height, bytes(context.extradata or b"")
 
 
-def _part(folder: Path, number: int) -> Path:
-    return folder if number == 0 else folder / f"part-{number:03d}"
-
-
-def _next_part(folder: Path) -> int:
-    """The number of the next part in a folder: nothing is in it, nor in those that follow."""
+def _next_part(folder: Path) -> Path:
+    """The folder of the next part: nothing is in it, nor in those that follow."""
     try:
         entries = [entry.name for entry in folder.iterdir()] if folder.exists() else []
     except OSError as error:
         raise StorageError(f"The folder {folder} cannot be read ({error.strerror}).") from None
+    if not entries:
+        return folder
     parts = (re.fullmatch(r"part-(\d{3,})", name) for name in entries)
-    return 1 + max((int(part[1]) for part in parts if part), default=0) if entries else 0
+    return folder / f"part-{1 + max((int(part[1]) for part in parts if part), default=0):03d}"

@@ -18,7 +18,7 @@ by two running sums, and halves the compressed size.
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -122,16 +122,21 @@ class ResumeCache:
 def write_pictures(path: Path, frame: MultiViewFrame, *, origin_seconds: float) -> None:
     """Writes a frame's pictures ``[H, W, 3]`` and masks ``[H, W]`` atomically and durably."""
     compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
-    entries: dict[str, dict[str, Any]] = {"images": {}, "masks": {}}
     packed = []
-    arrays: dict[str, Mapping[str, NDArray[Any]]] = {"images": frame.images, "masks": frame.masks}
-    for kind, own in arrays.items():
-        for name, array in own.items():
-            packed.append(compressor.compress((residuals(array) if kind == "images" else array).tobytes()))
-            entries[kind][name] = [list(array.shape), len(packed[-1])]
-    header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,
-              "captured_unix_seconds": frame.captured_unix_seconds, "origin_seconds": origin_seconds,
-              **entries}  # fmt: skip
+
+    def pack(array: NDArray[Any]) -> list[Any]:
+        packed.append(compressor.compress(array.tobytes()))
+        return [list(array.shape), len(packed[-1])]
+
+    header = {
+        "format": FORMAT,
+        "index": frame.index,
+        "pts_seconds": frame.pts_seconds,
+        "captured_unix_seconds": frame.captured_unix_seconds,
+        "origin_seconds": origin_seconds,
+        "images": {name: pack(residuals(image).reshape(image.shape)) for name, image in frame.images.items()},
+        "masks": {name: pack(mask) for name, mask in frame.masks.items()},
+    }
     atomic_write(path, [json.dumps(header).encode() + b"\n", *packed], called="The pictures")
 
 
@@ -144,8 +149,8 @@ def read_pictures(path: Path) -> tuple[MultiViewFrame, float]:
                 raise ValueError("another format")
             images = {name: restored(_read(file, entry, np.uint8, (3,))) for name, entry in header["images"].items()}
             masks = {name: _read(file, entry, np.bool_, ()) for name, entry in header["masks"].items()}
-        times = float(header["pts_seconds"]), header["captured_unix_seconds"]
-        return MultiViewFrame(int(header["index"]), times[0], images, masks, times[1]), float(header["origin_seconds"])
+        pts, captured, origin = (header[f"{name}_seconds"] for name in ("pts", "captured_unix", "origin"))
+        return MultiViewFrame(int(header["index"]), float(pts), images, masks, captured), float(origin)
     except (OSError, ValueError, KeyError, TypeError, zstandard.ZstdError) as error:
         raise CaptureError(
             f"The pictures {path} are damaged ({error}). Without them the stream cannot be resumed; begin another one."

@@ -4,8 +4,8 @@
 A file that cannot be read, or that does not fit the calibration, is a ``CaptureError`` with file and key.
 """
 
-import math
 import re
+import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from enum import StrEnum
@@ -152,72 +152,45 @@ def _parse(kind: type[Parsed], entry: Any, *, where: str) -> Parsed:
 
 
 def _checked(key: str, value: Any, where: str) -> Any:
-    check, expected = CHECKS[key]
-    try:
-        return check(value)
-    except (ValueError, TypeError):
-        found = "..." if key in ("url", "options") else repr(value)  # these may have a password
-        raise CaptureError(f"{key} = {found} in {where} is invalid; expected {expected}.") from None
+    is_valid, convert, expected = CHECKS[key]
+    if is_valid(value):
+        return convert(value)
+    found = "..." if key in ("url", "options") else repr(value)  # these may have a password
+    raise CaptureError(f"{key} = {found} in {where} is invalid; expected {expected}.")
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise TypeError
-    return value
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value != ""
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise TypeError
-    return float(value)
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
-def _positive(value: Any) -> float:
-    if _number(value) <= 0:
-        raise ValueError
-    return float(value)
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and value > 0
 
 
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 2 <= value <= 10_000:
-        raise ValueError
-    return value
-
-
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError
-    return value
-
-
-def _names(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise TypeError
-    return tuple(_text(item) for item in value)
-
-
-def _texts(value: Any) -> dict[str, str]:
-    if not isinstance(value, dict):
-        raise TypeError
-    return {_text(key): _text(item) for key, item in value.items()}
-
-
-CHECKS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
-    "url": (_text, "a text, such as rtsp://10.0.0.11/stream"),
-    "offset_seconds": (_number, "seconds"),
-    "format": (_text, "the name of a container or device, such as mpegts"),
-    "options": (_texts, "a table of texts"),
-    "follow": (_flag, "true or false"),
-    "name": (_text, "a text"),
-    "calibration": (lambda value: Path(_text(value)), "the folder of a capture"),
-    "cameras": (dict, "a table for each camera"),
-    "fps": (_positive, "frames a second, more than 0"),
-    "clock": (TimeBase, "arrival, stream or unix"),
-    "queue_frames": (_count, "a whole number from 2 to 10000"),
-    "without": (_names, "a list of names"),
+CHECKS: Mapping[str, tuple[Callable[[Any], bool], Callable[[Any], Any], str]] = {
+    "url": (_is_text, str, "a text, such as rtsp://10.0.0.11/stream"),
+    "offset_seconds": (_is_number, float, "seconds"),
+    "format": (_is_text, str, "the name of a container or device, such as mpegts"),
+    "options": (
+        lambda value: isinstance(value, dict) and all(map(_is_text, (*value, *value.values()))),
+        dict,
+        "a table of texts",
+    ),
+    "follow": (lambda value: isinstance(value, bool), bool, "true or false"),
+    "name": (_is_text, str, "a text"),
+    "calibration": (_is_text, Path, "the folder of a capture"),
+    "cameras": (lambda value: isinstance(value, dict), dict, "a table for each camera"),
+    "fps": (_is_positive, float, "frames a second, more than 0"),
+    "clock": (lambda value: value in [*TimeBase], TimeBase, "arrival, stream or unix"),
+    "queue_frames": (lambda value: type(value) is int and 2 <= value <= 10_000, int, "a whole number from 2 to 10000"),
+    "without": (lambda value: isinstance(value, list) and all(map(_is_text, value)), tuple, "a list of names"),
     **{
-        f"{key}_seconds": (_positive, "seconds, more than 0")
+        f"{key}_seconds": (_is_positive, float, "seconds, more than 0")
         for key in ("tolerance", "deadline", "stuck", "silent", "start", "end")
     },
 }
-"""What reads the value of a key, and what it expects."""
+"""By key: whether a value is one, what converts it, and what is expected."""

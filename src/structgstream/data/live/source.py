@@ -2,7 +2,6 @@
 """Live cameras as a stream of frames of unknown length, with the calibration of a capture."""
 
 import logging
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from structgstream.data.live.ingest import Ingest
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
-from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import CameraStatus, Fault, FaultLog, LiveStatus
 from structgstream.data.live.synchronizer import PictureSet
 from structgstream.data.masks import masks_folder, with_masks
@@ -32,6 +30,7 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     undistorted,
 )
+from structgstream.data.sound import LiveSound
 from structgstream.data.source import FrameSource
 from structgstream.data.undistortion import lenses_of
 from structgstream.data.video import srgb
@@ -96,10 +95,8 @@ class LiveOptions:
 
 
 class LiveSource:
-    """Frames of live cameras (docs/live.md). Cameras are opened when the first live frame is asked for.
-
-    Args:
-        stream: the stream to write, next to which the resume cache lies (:class:`ResumeCache`).
+    """Frames of live cameras (docs/live.md). Cameras are opened when the first live frame is asked for. The resume
+    cache (:class:`ResumeCache`) lies next to ``stream``, the stream to write.
 
     Raises:
         CaptureError: the rig file or the calibration is broken; while reading, a frame of the past is not cached.
@@ -129,7 +126,7 @@ class LiveSource:
         self.points: NDArray[np.float64] | None = None
         self.faults = FaultLog(self.name, now=time.monotonic)
         self._cache = ResumeCache(resume_folder(stream), cameras=self.rig.training, resume=options.resume)
-        self._stopped = threading.Event()
+        self.stopped = False
         self._ingest: Ingest | None = None
         self._small_sets = 0
         self._times = 0.0, 0.0  # of the last set: when its last picture arrived, and when it was complete
@@ -142,12 +139,7 @@ class LiveSource:
 
     def stop(self) -> None:
         """Ends the stream before the next frame; may be called from any thread or a signal's handler."""
-        self._stopped.set()
-
-    @property
-    def stopped(self) -> bool:
-        """Whether :meth:`stop` was called."""
-        return self._stopped.is_set()
+        self.stopped = True
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         """If the stream is resumed, the cached frames from ``start`` on; then live ones."""
@@ -188,8 +180,7 @@ class LiveSource:
         self.stop()
 
     def _live_frames(self, start: int) -> Iterator[MultiViewFrame]:
-        last = self._cache.last() if self._options.resume else None
-        pts, origin = (None, None) if last is None else last
+        pts, origin = (self._cache.last() if self._options.resume else None) or (None, None)
         with self._running() as (ingest, recording):
             frames = self._calibrated(self._arriving(ingest, is_first=start == 0)).frames()
             for index, frame in enumerate(frames, start):

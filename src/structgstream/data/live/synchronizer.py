@@ -67,10 +67,6 @@ class FrameSynchronizer:
         deadline_seconds: how long a set waits for its pictures.
         queue_frames: maximum number of waiting pictures of a camera; the oldest are dropped.
         started: when the cameras were opened; they count as present as if they had sent a picture then.
-
-    Attributes:
-        changed: the lock, which is notified when another set may be complete.
-        last_arrived: when the last picture arrived, monotonic seconds.
     """
 
     def __init__(
@@ -90,8 +86,8 @@ class FrameSynchronizer:
         self._present = deadline_seconds + 1 / fps  # from one picture to the next at most
         self._max_queue, self._count = queue_frames, count
         self._last = -float("inf")
-        self.changed = threading.Condition()
-        self.last_arrived = started
+        self.changed = threading.Condition()  # the lock, which is notified when another set may be complete
+        self.last_arrived = started  # monotonic seconds
 
     def add(self, camera: str, picture: LivePicture) -> None:
         """Adds a picture, whose time is after the camera's last one."""
