@@ -14,6 +14,14 @@ are tracked.
 
 A clock was reset if a stamp goes back by more than :data:`RESET_SECONDS`, or is that much earlier than the minimum
 delay allows. Pictures that a network delayed come late, never early, so they do not look like a reset.
+
+Note [Backlog]
+~~~~~~~~~~~~~~
+A connection often begins with a backlog: what a server has cached since its last key frame, or what came while FFmpeg
+probed the stream. Its pictures arrive faster than they were taken, so the minimum delay falls with each of them, and
+the time of a picture is too late by all that is left of the backlog. So with ``arrival`` the first picture of a
+connection is delivered only with the next one, and not at all if that lowers the minimum by more than
+:data:`BACKLOG_SHARE` of the step between their stamps; then the next one waits in turn.
 """
 
 import logging
@@ -45,6 +53,7 @@ log = logging.getLogger(__name__)
 RESET_SECONDS = 1.0
 WINDOW_SECONDS = 15.0
 DUPLICATE_SECONDS = 1e-6
+BACKLOG_SHARE = 0.1
 SAME_RESET_SECONDS = 0.1
 FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_WRAP_SECONDS = 2**33 / 90_000
@@ -68,6 +77,7 @@ class PictureTime:
     seconds: float | None  # on the common clock; None if the picture must not be used
     fault: Fault | None = None  # what was wrong with its time stamp, or None
     reset_seconds: float = 0.0  # by how much the camera's clock was reset, with :attr:`Fault.JUMP`
+    certain: bool = True  # False: only the next picture shows whether it waited in a backlog (Note [Backlog])
 
 
 class ClockResets:
@@ -145,21 +155,29 @@ class ClockMapper:
         step, delay, reconnected = stamp - self._stamp, arrived - stamp, self._reconnected
         self._reconnected = False
         if reconnected and (step <= 0 or delay < self._delay.value - RESET_SECONDS):
-            return PictureTime(self._after_reset(stamp, delay, arrived).seconds)
+            return self._begun(self._after_reset(stamp, delay, arrived).seconds)
         if abs(step) < DUPLICATE_SECONDS:
             return PictureTime(None, Fault.DUPLICATE)
         if step <= -RESET_SECONDS or delay < self._delay.value - RESET_SECONDS:
             return self._after_reset(stamp, delay, arrived)
         if step < 0:
             return PictureTime(None, Fault.REORDERED)
+        earlier = self._delay.value - delay
         self._delay.add(delay, arrived)
-        return self._mapped(stamp)
+        time = self._mapped(stamp)
+        if self.base is TimeBase.ARRIVAL and earlier > BACKLOG_SHARE * step:
+            return PictureTime(time.seconds, Fault.BACKLOG, certain=False)
+        return time
 
     def _first(self, stamp: float, arrived: float, wrap_seconds: float | None) -> PictureTime:
         if self.base is TimeBase.UNIX and wrap_seconds is not None:
             self._shift = round((arrived - stamp) / wrap_seconds) * wrap_seconds
         self._delay.restart(arrived - stamp, arrived)
-        return self._mapped(stamp)
+        return self._begun(self._mapped(stamp).seconds)
+
+    def _begun(self, seconds: float | None) -> PictureTime:
+        """Of the first picture of a connection."""
+        return PictureTime(seconds, certain=self.base is not TimeBase.ARRIVAL)
 
     def _after_reset(self, stamp: float, delay: float, arrived: float) -> PictureTime:
         """The pictures continue with the delay that they had before the reset."""
@@ -244,6 +262,7 @@ class CameraFeed:
         self._unstamped = 0
         self._wrap_seconds: float | None = None  # after which stamps of the container begin again
         self._stamp: float | None = None  # of the last picture, as it came
+        self._uncertain: LivePicture | None = None  # which waits for the next one (Note [Backlog])
         self._usable = True
         self.ended = False
         self.decoded = 0
@@ -419,11 +438,24 @@ class CameraFeed:
         arrived = self._now()
         self.decoded += 1
         self._report_back(arrived)
-        seconds = self._common_time(frame, arrived)
+        time = self._common_time(frame, arrived)
         self._usable = self._has_calibrated_shape(frame)
-        if seconds is not None and self._usable and not self._is_frozen(frame, arrived):
-            self._synchronizer.add(self.name, LivePicture(seconds, arrived, frame))
+        if time.seconds is not None and self._usable and not self._is_frozen(frame, arrived):
+            self._deliver(LivePicture(time.seconds, arrived, frame), time)
         return self._clock.shift
+
+    def _deliver(self, picture: LivePicture, time: PictureTime) -> None:
+        """Passes a picture on, or keeps it until the next one shows that it did not wait (Note [Backlog])."""
+        if time.fault is not Fault.BACKLOG:
+            self._deliver_uncertain()
+        self._uncertain = None if time.certain else picture
+        if time.certain:
+            self._synchronizer.add(self.name, picture)
+
+    def _deliver_uncertain(self) -> None:
+        if self._uncertain is not None:
+            self._synchronizer.add(self.name, self._uncertain)
+            self._uncertain = None
 
     def _pace(self, frame: "VideoFrame") -> None:
         """Reads a complete file at its frame rate."""
@@ -433,8 +465,8 @@ class CameraFeed:
             self._paced = self._now() - frame.time
         self._stop.wait(max(self._paced + frame.time - self._now(), 0.0))
 
-    def _common_time(self, frame: "VideoFrame", arrived: float) -> float | None:
-        """When the picture was taken, on the common clock; None if it must not be used."""
+    def _common_time(self, frame: "VideoFrame", arrived: float) -> PictureTime:
+        """When the picture was taken, on the common clock."""
         unix = arrived + self._unix_offset
         if frame.pts is None or frame.time_base is None:
             stamp, wrap_seconds = self._substitute_stamp(unix), None
@@ -442,7 +474,7 @@ class CameraFeed:
             stamp, wrap_seconds = float(frame.pts * frame.time_base), self._wrap_seconds
             self._unstamped = 0
         if stamp is None:
-            return None
+            return PictureTime(None)
         self._stamp = stamp
         time = self._clock.map(stamp, arrived=unix, wrap_seconds=wrap_seconds)
         if time.fault is Fault.JUMP:
@@ -452,13 +484,15 @@ class CameraFeed:
             self._report_duplicate()
         elif time.fault is Fault.REORDERED:
             self._faults.report(self.name, time.fault, "sends pictures whose time stamps go back; they are left out")
+        elif time.fault is Fault.BACKLOG:
+            self._faults.count(self.name, time.fault)
         elif self._clock.base is TimeBase.UNIX and abs(far := (time.seconds or unix) - unix) > FAR_SECONDS:
             text = (
                 f"sends time stamps {abs(far):.0f} s from the Unix time of this machine; set the clocks, or take "
                 'clock = "arrival" in the rig file if its stamps are no Unix time'
             )
             self._faults.warn(self.name, "unix", text)
-        return time.seconds
+        return time
 
     def _substitute_stamp(self, unix: float) -> float | None:
         """The stamp to use for a picture without one; None if the picture must not be used."""
@@ -505,6 +539,7 @@ class CameraFeed:
 
     def _report_end(self, reason: str) -> None:
         """A file was read to its end, or cannot be read."""
+        self._deliver_uncertain()
         if self.decoded:
             how = "" if reason is ENDED else f" ({reason})"
             text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"

@@ -26,6 +26,7 @@ class Fault(StrEnum):
     JUMP = "jump"  # its clock was reset
     DUPLICATE = "duplicate"  # the time stamp of an earlier picture
     REORDERED = "reordered"  # a time stamp before the last one
+    BACKLOG = "backlog"  # the picture before came so long after it was taken that its time is unknown; left out
     NO_STAMP = "no stamp"
     OVERFLOW = "overflow"  # the queue was full: its oldest picture was dropped
     UNMATCHED = "unmatched"  # a picture that belonged to no set: late, between instants, or out of step
