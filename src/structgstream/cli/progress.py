@@ -78,10 +78,12 @@ def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | 
     return table
 
 
-def counting_bars(description: str, *more: ProgressColumn, console: Console, **options: bool) -> Progress:
+def counting_bars(
+    description: str, *more: ProgressColumn, console: Console, transient: bool = False, disable: bool = False
+) -> Progress:
     """Bars of tasks that count, with a ``description`` before and columns of ``more`` behind."""
     columns = (TextColumn(description), BarColumn(bar_width=32), MofNCompleteColumn(), *more)
-    return Progress(*columns, console=console, **options)
+    return Progress(*columns, console=console, transient=transient, disable=disable)
 
 
 @contextmanager
