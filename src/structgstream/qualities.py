@@ -126,7 +126,9 @@ class BitRates:
         """Writes the list, with the rates of the earlier run if it is resumed. Raises StorageError if it cannot be
         written."""
         if resume:
-            self._listed |= {name: bits for name, bits in listed_bits(self._folder).items() if name in self._listed}
+            with suppress(StreamError):  # An unreadable list is replaced.
+                listed = {one.name: one.bits_per_second for one in read_list(self._folder) or ()}
+                self._listed |= {name: bits for name, bits in listed.items() if name in self._listed}
         self._write()
 
     def add(self, name: str, report: FrameReport) -> None:
@@ -136,12 +138,12 @@ class BitRates:
     def refresh(self, *, last: bool = False) -> None:
         """Rewrites the list if a measured rate differs from the listed one. Raises StorageError if it cannot be
         written; the earlier list is not affected."""
+        fewest, share = (1, 0.0) if last else (MIN_PACKETS, CHANGE)
         known = {
             name: bits
             for name, packets in self._packets.items()
-            if len(packets) > (1 if last else MIN_PACKETS) and (bits := bits_per_second(packets)) is not None
+            if len(packets) > fewest and (bits := bits_per_second(packets)) is not None
         }
-        share = 0.0 if last else CHANGE
         if any(abs(bits - self._listed[name]) > share * self._listed[name] for name, bits in known.items()):
             self._listed |= known
             self._write()
@@ -163,14 +165,6 @@ def bits_per_second(packets: Sequence[tuple[float, int]]) -> float | None:
     """
     seconds = packets[-1][0] - packets[0][0]
     return max(8 * sum(size for _, size in [*packets][1:]) / seconds, 1.0) if seconds > 0 else None
-
-
-def listed_bits(folder: Path) -> Mapping[str, float]:
-    """Bit rates of the list in a folder, by name; empty if there is no readable list."""
-    try:
-        return {quality.name: quality.bits_per_second for quality in read_list(folder) or ()}
-    except StreamError:
-        return {}
 
 
 Value = TypeVar("Value")
@@ -203,36 +197,29 @@ class Once(Generic[Value]):
 
 
 @dataclass(frozen=True)
-class SharedWork:
-    """Shared results of the qualities of one run."""
+class SharedMethod(StructGStream):
+    """The method of one of several qualities, with the results that all share (Note [Shared work])."""
 
     # preprocessed pictures, by the number of a frame and whether they are compared with the frame before
     pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
-    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))  # fits of first frames, by frame number
-
-
-@dataclass(frozen=True)
-class SharedMethod(StructGStream):
-    """The method of one of several qualities (Note [Shared work])."""
-
-    shared: SharedWork = field(default_factory=SharedWork)  # the shared results
+    first_fits: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))  # by frame number
 
     def observe(
         self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
         key = frame.index, before is None
         observe = super().observe
-        return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
+        return self.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """See ``StructGStream``; only the quality that computed the fit reports its seconds."""
         first = super().first
-        fit, mine = self.shared.first.value(task.frame.index, lambda: first(task))
+        fit, mine = self.first_fits.value(task.frame.index, lambda: first(task))
         return fit if mine else replace(fit, seconds={})
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
-            self.shared.first.clear()
+            self.first_fits.clear()
         return super().next(past, task)
 
 
@@ -330,7 +317,7 @@ def record_qualities(
         StreamError: a stream to resume is damaged so that it cannot be continued.
         StorageError: a stream, a log or the list cannot be written; complete frames are not affected.
     """
-    work = SharedWork()
+    method = SharedMethod(config)
     opened, stated = [], metadata
     for quality in qualities:
         sink, stored = storages[quality.name](resume)
@@ -338,7 +325,7 @@ def record_qualities(
             sink, stated = with_sound(sink, metadata, sound, source=source, resumed=stored)
         own = configured(config, quality)
         # Frames are denoised below, once for all qualities.
-        pipeline = replace(stream_pipeline(own), method=SharedMethod(own, shared=work), denoising=DenoisingConfig())
+        pipeline = replace(stream_pipeline(own), method=replace(method, config=own), denoising=DenoisingConfig())
         opened.append(_Opened(quality.name, pipeline, sink, stored))
     shown = read_ahead(denoised(source, config.denoising))
     frames = SharedFrames(shown, starts=[one.start for one in opened], first=[one.first for one in opened])

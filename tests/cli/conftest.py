@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli import main
-from tests.support.quick_streams import CLIP, QUICK, SMALL
+from tests.support.quick_streams import CLIP, QUICK, SMALL, Runner, runner_of
 from tests.support.shared_folder import made_once
 from tests.support.small_presets import few_points
 
@@ -28,6 +28,12 @@ def quick_tiny() -> Iterator[None]:
     """The preset tiny with few initial points, also for what a module makes once for all its tests."""
     with few_points("tiny"):
         yield
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Runner:
+    """Runs a command and returns what it has printed."""
+    return runner_of(capsys)
 
 
 @pytest.fixture

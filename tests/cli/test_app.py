@@ -14,7 +14,7 @@ import structgstream
 from structgstream.cli import app
 from structgstream.cli.app import COMMANDS, main
 from structgstream.errors import CaptureError, OutOfMemoryError
-from tests.support.quick_streams import CLIP, error_of
+from tests.support.quick_streams import CLIP, Runner
 
 
 @pytest.fixture
@@ -34,26 +34,22 @@ def raising(error: BaseException):
     return action
 
 
-def test_help_names_every_command_and_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
+def test_help_names_every_command_and_has_examples(run: Runner) -> None:
+    text = run(["--help"]).out
     assert all(f"\n  {name} " in text for name in COMMANDS)
     assert "examples:" in text
 
 
-def test_nothing_given_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == 2
-    assert "usage: structgstream" in capsys.readouterr().err
+def test_nothing_given_is_wrong_usage(run: Runner) -> None:
+    assert "usage: structgstream" in run([], status=2).err
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out.strip() == structgstream.__version__
+def test_version(run: Runner) -> None:
+    assert run(["--version"]).out.strip() == structgstream.__version__
 
 
-def test_a_misspelt_command_is_named_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evalaute"]) == 2
-    assert "Did you mean 'evaluate'?" in capsys.readouterr().err
+def test_a_misspelt_command_is_named_with_the_nearest(run: Runner) -> None:
+    assert "Did you mean 'evaluate'?" in run(["evalaute"], status=2).err
 
 
 @pytest.mark.parametrize(
@@ -86,25 +82,21 @@ def test_what_goes_wrong_is_one_sentence_without_a_traceback(
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), app.Interrupted("Go on with --resume.")])
-def test_ctrl_c_ends_cleanly(command, error: BaseException, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_cleanly(command, error: BaseException, run: Runner) -> None:
     command(raising(error))
-    assert main(["reconstruct"]) == 130
-    assert capsys.readouterr().err.strip() == f"Interrupted. {error}".strip()
+    assert run(["reconstruct"], status=130).err.strip() == f"Interrupted. {error}".strip()
 
 
-def test_every_command_has_help_with_an_example_and_no_torch(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_help_with_an_example_and_no_torch(run: Runner) -> None:
     for name in COMMANDS:
-        assert main([name, "--help"]) == 0
-        assert f"Example: structgstream {name}" in capsys.readouterr().out
+        assert f"Example: structgstream {name}" in run([name, "--help"]).out
     code = f"import sys; from structgstream.cli import main; [main([name, '--help']) for name in {[*COMMANDS]}]; "
     code += "print([m for m in ('torch', 'numpy', 'av', 'cv2', 'matplotlib') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]"
 
 
-def test_another_distribution_brings_commands(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_distribution_brings_commands(monkeypatch: pytest.MonkeyPatch, run: Runner) -> None:
     called: list[list[str]] = []
     package = ModuleType("brought")
     package.COMMANDS = {"count": "count the frames"}  # type: ignore[attr-defined]
@@ -118,10 +110,8 @@ def test_another_distribution_brings_commands(
     )
     assert main(["count", "--all"]) == 0
     assert called == [["--all"]]
-    assert main(["--help"]) == 0
-    assert "\n  count        count the frames\n" in capsys.readouterr().out
-    assert main(["cuont"]) == 2
-    assert "Did you mean 'count'?" in capsys.readouterr().err
+    assert "\n  count        count the frames\n" in run(["--help"]).out
+    assert "Did you mean 'count'?" in run(["cuont"], status=2).err
 
 
 def test_exit_status_of_the_program() -> None:
@@ -131,12 +121,12 @@ def test_exit_status_of_the_program() -> None:
     assert "--json" in result.stderr
 
 
-def test_paths_that_cannot_work_are_reported(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_cannot_work_are_reported(stream: Path, tmp_path: Path, run: Runner) -> None:
     new = str(tmp_path / "new.sgs")
-    assert "does not exist" in error_of(["reconstruct", str(tmp_path / "no"), "-o", new], capsys, status=1)
-    assert "is a folder" in error_of(["reconstruct", CLIP, "-o", str(tmp_path)], capsys, status=1)
-    assert "cannot be created" in error_of(["reconstruct", CLIP, "-o", str(stream / "x" / "y")], capsys, status=1)
-    assert str(tmp_path / "no") in error_of(["inspect", str(tmp_path / "no")], capsys, status=1)
+    assert "does not exist" in run(["reconstruct", str(tmp_path / "no"), "-o", new], status=1).err
+    assert "is a folder" in run(["reconstruct", CLIP, "-o", str(tmp_path)], status=1).err
+    assert "cannot be created" in run(["reconstruct", CLIP, "-o", str(stream / "x" / "y")], status=1).err
+    assert str(tmp_path / "no") in run(["inspect", str(tmp_path / "no")], status=1).err
     (tmp_path / "text").write_text("hello, this is no stream at all")
-    assert "text" in error_of(["evaluate", str(tmp_path / "text"), CLIP], capsys, status=1)
-    assert "demo writes no .sgs" in error_of(["demo", "--output", str(stream)], capsys, status=2)
+    assert "text" in run(["evaluate", str(tmp_path / "text"), CLIP], status=1).err
+    assert "demo writes no .sgs" in run(["demo", "--output", str(stream)], status=2).err

@@ -18,7 +18,7 @@ from structgstream.codec.sinks import FileSink
 from structgstream.exporters.formats import FORMATS, PAGES
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
-from tests.support.quick_streams import error_of
+from tests.support.quick_streams import Runner
 from tests.support.rigs import random_scene
 from tests.support.streams import compact_header, header_for, write_stream
 
@@ -41,11 +41,11 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, run: Runner) -> None:
     out = tmp_path / "one.ply"
-    assert main(["export", str(stream), "-o", str(out), "--frame", "1", "--device", "reference"]) == 0
+    said = run(["export", str(stream), "-o", str(out), "--frame", "1", "--device", "reference"]).out
     vertices = PlyData.read(str(out))["vertex"].data
-    assert f"{len(vertices):,} Gaussians" in capsys.readouterr().out
+    assert f"{len(vertices):,} Gaussians" in said
     assert [entry.name for entry in tmp_path.iterdir()] == ["one.ply"]
     reader = open_stream(stream)
     header, scene = reader.header, reader.scene(1)
@@ -74,26 +74,21 @@ def test_a_sequence_fills_a_folder(stream: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / "frame_000002.ply").read_bytes()
 
 
-def test_frames_of_an_earlier_export_in_a_folder_are_named(
-    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_of_an_earlier_export_in_a_folder_are_named(stream: Path, tmp_path: Path, run: Runner) -> None:
     arguments = ["export", str(stream), "-o", str(tmp_path / "out"), "--device", "reference"]
-    assert main(arguments) == 0
-    assert "earlier export" not in capsys.readouterr().out
-    assert main([*arguments, "--frames", "0", "1"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    assert "earlier export" not in run(arguments).out
+    said = " ".join(run([*arguments, "--frames", "0", "1"]).out.split())
     assert "also has 1 frame of an earlier export, such as frame_000002.ply;" in said
 
 
-def test_a_zip_has_the_files_of_the_folder(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_zip_has_the_files_of_the_folder(stream: Path, tmp_path: Path, run: Runner) -> None:
     common = ["export", str(stream), "--device", "reference", "--sh-degree", "0"]
     assert main([*common, "-o", str(tmp_path / "all")]) == 0
-    assert main([*common, "-o", str(tmp_path / "all.zip")]) == 0
+    said = run([*common, "-o", str(tmp_path / "all.zip")]).out
     with zipfile.ZipFile(tmp_path / "all.zip") as archive:
         assert {name: archive.read(name) for name in archive.namelist()} == {
             path.name: path.read_bytes() for path in (tmp_path / "all").iterdir()
         }
-    said = capsys.readouterr().out
     assert "3 frames" in said
     assert re.search(r"of frame 0, against the stream's own pictures: PSNR \d\d\.\d dB at", " ".join(said.split()))
 
@@ -116,11 +111,10 @@ def test_parts_of_a_frame(stream: Path, tmp_path: Path) -> None:
     assert np.array_equal(few, whole[np.sort(np.argsort(-volumes, kind="stable")[:10])])
 
 
-def test_the_list_of_formats(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "--list"]) == 0
-    said = capsys.readouterr().out
+def test_the_list_of_formats(run: Runner) -> None:
+    said = run(["export", "--list"]).out
     assert all(name in said for name in (*FORMATS, *PAGES))
-    assert "export needs a stream file" in error_of(["export"], capsys, status=2)
+    assert "export needs a stream file" in run(["export"], status=2).err
 
 
 def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
@@ -150,22 +144,16 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_requests(
-    stream: Path,
-    arguments: list[str],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    stream: Path, arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Runner
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert words in error_of(["export", str(stream), *arguments], capsys, status=2)
+    assert words in run(["export", str(stream), *arguments], status=2).err
     assert not list(tmp_path.iterdir())
 
 
-def test_a_page_with_a_player(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_with_a_player(stream: Path, tmp_path: Path, run: Runner) -> None:
     page = tmp_path / "ball.html"
-    assert main(["export", str(stream), "-o", str(page)]) == 0
-    said = capsys.readouterr().out
+    said = run(["export", str(stream), "-o", str(page)]).out
     assert f"Wrote {page}" in said
     assert page.as_uri() in said
     text = page.read_text()
@@ -177,9 +165,9 @@ def test_a_page_with_a_player(stream: Path, tmp_path: Path, capsys: pytest.Captu
     assert (tmp_path / "copy.html").read_text() == text.replace("<title>small<", "<title>copy<")
 
 
-def test_a_folder_for_a_web_server(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(stream), "-o", str(tmp_path / "on.line"), "--format", "site"]) == 0
-    assert "put the folder on any web server" in capsys.readouterr().out
+def test_a_folder_for_a_web_server(stream: Path, tmp_path: Path, run: Runner) -> None:
+    said = run(["export", str(stream), "-o", str(tmp_path / "on.line"), "--format", "site"]).out
+    assert "put the folder on any web server" in said
     assert (tmp_path / "on.line" / "stream.sgs").read_bytes() == stream.read_bytes()
     copy = tmp_path / "copy.sgs"
     copy.write_bytes(stream.read_bytes())
@@ -187,7 +175,7 @@ def test_a_folder_for_a_web_server(stream: Path, tmp_path: Path, capsys: pytest.
     assert (tmp_path / "copy-site" / "index.html").is_file()
 
 
-def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, run: Runner) -> None:
     scenes = frames_of_a_scene(anchors=8, free=2) * 3
     header = compact_header(scenes[0])
     whole = tmp_path / "whole.sgs"
@@ -197,31 +185,28 @@ def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, capsys: pytest.Ca
     damaged = tmp_path / "damaged.sgs"
     damaged.write_bytes(data)
     common = ["export", str(damaged), "--device", "reference", "-o"]
-    assert main([*common, str(tmp_path / "all")]) == 0
-    assert "2 of 9 frames are lost, the first is 4" in capsys.readouterr().out
+    assert "2 of 9 frames are lost, the first is 4" in run([*common, str(tmp_path / "all")]).out
     assert sorted(entry.stem for entry in (tmp_path / "all").iterdir()) == [
         f"frame_{i:06d}" for i in (0, 1, 2, 3, 6, 7, 8)
     ]
     assert main([*common, str(tmp_path / "some"), "--frames", "6", "7"]) == 0
     assert len(list((tmp_path / "some").iterdir())) == 2
     for frames in (("--frames", "3", "6"), ("--frames", "4", "5")):
-        error = error_of(["export", str(damaged), "-o", str(tmp_path / "none"), *frames], capsys, status=2)
+        error = run(["export", str(damaged), "-o", str(tmp_path / "none"), *frames], status=2).err
         assert "the stream has frames 0 to 3 and 6 to 8; there is no range from" in error
-    assert "is damaged" in error_of([*common, str(tmp_path / "x.ply"), "--frame", "4"], capsys, status=1)
+    assert "is damaged" in run([*common, str(tmp_path / "x.ply"), "--frame", "4"], status=1).err
     assert main([*common, str(tmp_path / "x.ply"), "--frame", "8"]) == 0
 
 
-def test_problems_of_the_stream_and_of_the_disk(
-    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_problems_of_the_stream_and_of_the_disk(stream: Path, tmp_path: Path, run: Runner) -> None:
     empty = tmp_path / "empty.sgs"
     scenes = frames_of_a_scene(anchors=0, free=0)
     write_stream(FileSink(empty), scenes, header=header_for(scenes[0]))
     crop = ["--frame", "0", "--crop", "90", "90", "90", "99", "99", "99"]
-    assert "leave none of" in error_of(["export", str(stream), *crop, "-o", str(tmp_path / "x.ply")], capsys, status=1)
-    assert "nothing to export" in error_of(["export", str(empty), "--frame", "0"], capsys, status=1)
-    assert "no such" in error_of(["export", str(tmp_path / "none.sgs")], capsys, status=1).lower()
+    assert "leave none of" in run(["export", str(stream), *crop, "-o", str(tmp_path / "x.ply")], status=1).err
+    assert "nothing to export" in run(["export", str(empty), "--frame", "0"], status=1).err
+    assert "no such" in run(["export", str(tmp_path / "none.sgs")], status=1).err.lower()
     (tmp_path / "file").write_text("")
     inside = ["export", str(stream), "-o", str(tmp_path / "file" / "x.ply"), "--frame", "0"]
-    assert f"cannot be written ({tmp_path / 'file'} is a file)" in error_of(inside, capsys, status=1)
+    assert f"cannot be written ({tmp_path / 'file'} is a file)" in run(inside, status=1).err
     assert {entry.name for entry in tmp_path.iterdir()} == {"empty.sgs", "file"}

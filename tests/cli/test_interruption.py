@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C arrives, also where something on the way loses it."""
+"""Ctrl-C arrives, also where something on the way loses it; of two signals the first asks, the second ends."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import pytest
 
-from structgstream.cli.app import interruptible
+from structgstream.cli.app import StopSignal, Terminated, interruptible
 
 LONG = 60.0
 
@@ -24,7 +24,9 @@ def as_in_a_terminal() -> Iterator[None]:
     """A shell ignores Ctrl-C in what it runs in the background, which tests may be."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
+    clean = untouched()
     signal.signal(signal.SIGINT, before)
+    assert clean
 
 
 def untouched() -> bool:
@@ -36,7 +38,6 @@ def untouched() -> bool:
 def test_ctrl_c_leaves_the_block() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible():
         press()
-    assert untouched()
 
 
 def test_an_error_that_is_made_of_it_is_ctrl_c() -> None:
@@ -49,7 +50,6 @@ def test_an_error_that_is_made_of_it_is_ctrl_c() -> None:
     with pytest.raises(KeyboardInterrupt) as found, interruptible():
         library()
     assert isinstance(found.value.__cause__, RuntimeError)
-    assert untouched()
 
 
 def test_what_swallows_it_gets_it_again() -> None:
@@ -63,13 +63,11 @@ def test_what_swallows_it_gets_it_again() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible(again_seconds=0.05):
         library()
     assert time.monotonic() - begun < LONG
-    assert untouched()
 
 
 def test_a_block_that_ends_meanwhile_was_interrupted_all_the_same() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible(), suppress(KeyboardInterrupt):
         press()
-    assert untouched()
 
 
 def test_without_ctrl_c_nothing_is_changed() -> None:
@@ -77,7 +75,6 @@ def test_without_ctrl_c_nothing_is_changed() -> None:
         pass
     with pytest.raises(RuntimeError, match="of its own"), interruptible():
         raise RuntimeError("of its own")
-    assert untouched()
 
 
 def test_ignored_as_under_nohup_it_stays_ignored() -> None:
@@ -101,3 +98,52 @@ def test_another_thread_has_no_signals() -> None:
     thread.start()
     thread.join()
     assert seen == [signal.default_int_handler]
+
+
+@pytest.mark.parametrize(
+    ("number", "raised", "said"),
+    [(signal.SIGTERM, Terminated, ""), (signal.SIGINT, KeyboardInterrupt, "Ends after this frame; Ctrl-C again")],
+)
+def test_the_first_signal_is_remembered_and_the_second_ends(
+    number: signal.Signals, raised: type[BaseException], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, asked = signal.getsignal(number), []
+    with StopSignal(lambda: asked.append(True), number=number) as ending:
+        ending.end(whole=False)
+        os.kill(os.getpid(), number)
+        assert (ending.asked, asked) == (True, [True])
+        assert capsys.readouterr().err.startswith(said)
+        ending.end(whole=True)
+        with pytest.raises(raised):
+            ending.end(whole=False)
+        with pytest.raises(raised):
+            os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is before
+
+
+def test_what_was_there_before_comes_back_however_the_block_ends() -> None:
+    heard: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    try:
+        with StopSignal():
+            pass
+        with pytest.raises(KeyError), StopSignal():
+            raise KeyError
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert heard == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_another_thread_has_no_signals_and_changes_nothing() -> None:
+    before, found = signal.getsignal(signal.SIGTERM), []
+
+    def run() -> None:
+        with StopSignal() as ending:
+            found.append((ending.asked, signal.getsignal(signal.SIGTERM)))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert found == [(False, before)]
+    assert signal.getsignal(signal.SIGTERM) is before

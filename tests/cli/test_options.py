@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What options come to: the part of a capture, and a configuration edited by paths."""
+"""What options come to: the part of a capture, a configuration edited by paths; and what doctor says is there."""
 
+import importlib.metadata
 import json
 from pathlib import Path
 
 import pytest
 
-from structgstream.cli.app import UsageError, main
+from structgstream.cli import doctor
+from structgstream.cli.app import UsageError
 from structgstream.cli.groups import Join
 from structgstream.cli.options import (
     CaptureOptions,
@@ -16,7 +18,9 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.data.dataset_layouts import bundled_clip_path
+from structgstream.kernels import backend
 from structgstream.session.presets import DEFAULT_PRESET, PRESETS
+from tests.support.quick_streams import Runner
 
 
 def test_options_of_a_capture_choose_its_part() -> None:
@@ -52,7 +56,7 @@ def test_a_configuration_is_a_preset_with_edits() -> None:
     assert config.initial == PRESETS["tiny"].initial
 
 
-def test_no_command_writes_a_file_of_another_kind(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_no_command_writes_a_file_of_another_kind(run: Runner, tmp_path: Path) -> None:
     for arguments in (
         ["archive", "x", "-o", "a.mp4"],
         ["join", "x.sgs", "-o", "a.html"],
@@ -65,8 +69,7 @@ def test_no_command_writes_a_file_of_another_kind(capsys: pytest.CaptureFixture[
         ["board", "-o", "a.png"],
         ["track", "x", "--init", "h.sgs", "-o", "h.sgs"],
     ):
-        assert main(arguments) == 2
-        said = capsys.readouterr().err
+        said = run(arguments, status=2).err
         assert "writes no ." in said
         assert not said.rstrip().endswith("writes .")
 
@@ -86,8 +89,46 @@ def test_a_path_is_what_a_shell_makes_of_it(tmp_path: Path, monkeypatch: pytest.
         parse_options(Join, "join", arguments=["a.sgs", "-o", "~no-such-user/a"])
 
 
-def test_json_to_standard_output_is_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--json", "-"]) == 0
-    printed = capsys.readouterr()
+def test_json_to_standard_output_is_nothing_else(run: Runner) -> None:
+    printed = run(["doctor", "--json", "-"])
     assert json.loads(printed.out).keys() == {"environment", "backends", "packages"}
     assert "back-end" in printed.err
+
+
+def test_everything_is_listed(tmp_path: Path, run: Runner) -> None:
+    text = run(["doctor", "--json", str(tmp_path / "d.json")]).out
+    found = json.loads((tmp_path / "d.json").read_text())
+    assert [entry["name"] for entry in found["backends"]] == ["cuda", "cpu", "reference"]
+    assert sum(entry["state"].startswith("chosen") for entry in found["backends"]) == 1
+    names = {"av", "cv2", "scipy", "yaml", "matplotlib", "starlette", "uvicorn", "s3fs", "anywidget"}
+    names |= {"prometheus_client", "pxr", "fourdgs", "PIL", "pycolmap", "ray"}
+    assert {entry["name"] for entry in found["packages"]} == names
+    assert "reference" in text
+    assert "cores" in text
+    for entry in found["packages"]:
+        assert entry["version"] or f"structgstream[{entry['extra']}]" in text
+
+
+def test_what_is_missing_comes_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    reasons = {"cuda": "No GPU here.", "cpu": None, "reference": None}
+    monkeypatch.setattr(backend, "backend_reasons", lambda: reasons)
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    found = doctor.diagnose()
+    assert [entry["state"] for entry in found["backends"]] == ["missing", "chosen by --device auto", "available"]
+    assert found["backends"][0]["advice"] == "No GPU here."
+    advice = {entry["name"]: entry["advice"] for entry in found["packages"]}
+    assert "pip install 'structgstream[capture]'" in advice["av"]
+    assert "pip install 'structgstream[report]'" in advice["matplotlib"]
+
+
+def test_a_package_that_was_copied_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, missing = doctor.diagnose(), importlib.metadata.PackageNotFoundError
+    there = {entry["name"] for entry in found["packages"] if entry["version"]}
+
+    def no_metadata(name: str) -> str:
+        raise missing(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", no_metadata)
+    versions = {entry["name"]: entry["version"] for entry in doctor.diagnose()["packages"]}
+    assert there
+    assert versions == {name: "without a version" if name in there else None for name in versions}

@@ -1,31 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command prepare, as a user types it."""
+"""The commands prepare and board, as a user types them."""
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from structgstream.cli.app import main
+from structgstream.cli import main
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.options import Distance, PrepareOptions, parse_board
 from structgstream.preparation.output_folder import mark_output
 from tests.support.quick_preparation import quicken
-from tests.support.quick_streams import error_of
+from tests.support.quick_streams import Runner
 from tests.support.rooms import write_room
 
 
-def test_prepare_then_check_and_a_mistake(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prepare_then_check_and_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Runner) -> None:
     quicken(monkeypatch)
     write_room(tmp_path / "videos")
     out = tmp_path / "out"
     command = ["prepare", str(tmp_path / "videos"), "-o", str(out), "--synchronize", "none", "--held-out", "cam02"]
-    assert main(command) == 0
-    message = capsys.readouterr().out
+    message = run(command).out
     assert "calibrate    cameras.json: 5 cameras" in message
     assert "add cameras, or move them closer together. The check found no error; see the warnings." in " ".join(
         message.split()
@@ -36,23 +34,22 @@ def test_prepare_then_check_and_a_mistake(
     for entry in content["cameras"].values():
         entry["viewmat"] = [[entry["viewmat"][j][i] for j in range(3)] + [0.1] for i in range(3)] + [[0, 0, 0, 1]]
     file.write_text(json.dumps(content))
-    assert main(["prepare", "--check", str(out), "--report", str(tmp_path / "report")]) == 1
+    assert (
+        "structgstream: " in run(["prepare", "--check", str(out), "--report", str(tmp_path / "report")], status=1).err
+    )
     assert (tmp_path / "report" / "index.html").is_file()
-    assert "structgstream: " in capsys.readouterr().err
 
 
-def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["prepare", str(tmp_path)]) == 2
-    assert "-o CAPTURE" in capsys.readouterr().err
-    assert main(["prepare", str(tmp_path), "-o", str(tmp_path / "out"), "--size", "720p"]) == 2
-    assert "WIDTHxHEIGHT" in capsys.readouterr().err
-    for ignored in (["-o", str(tmp_path / "out")], ["--lens", "brown"]):
-        assert main(["prepare", "--check", str(tmp_path), *ignored]) == 2
-        assert "it takes --report alone" in " ".join(capsys.readouterr().err.split())
-    assert main(["prepare", str(tmp_path), "-o", str(tmp_path / "out"), "--report", str(tmp_path / "report")]) == 2
-    assert "--report goes with --check" in capsys.readouterr().err
-    assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
-    assert "is missing; give the folder" in capsys.readouterr().err
+def test_wrong_usage(tmp_path: Path, run: Runner) -> None:
+    out = ["-o", str(tmp_path / "out")]
+    assert "-o CAPTURE" in run(["prepare", str(tmp_path)], status=2).err
+    assert "WIDTHxHEIGHT" in run(["prepare", str(tmp_path), *out, "--size", "720p"], status=2).err
+    for ignored in (out, ["--lens", "brown"]):
+        error = run(["prepare", "--check", str(tmp_path), *ignored], status=2).err
+        assert "it takes --report alone" in " ".join(error.split())
+    report = ["--report", str(tmp_path / "report")]
+    assert "--report goes with --check" in run(["prepare", str(tmp_path), *out, *report], status=2).err
+    assert "is missing; give the folder" in run(["prepare", str(tmp_path / "nowhere"), *out], status=1).err
 
 
 def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +99,7 @@ def read_only(path: Path) -> None:
     ],
 )
 def test_what_may_not_be_read_or_written(
-    tmp_path: Path, place: str, change: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, place: str, change: Callable[[Path], None], said: str, run: Runner
 ) -> None:
     """One sentence that names it, and nothing of the input is changed."""
     write_room(tmp_path / "videos")
@@ -116,9 +113,36 @@ def test_what_may_not_be_read_or_written(
     change(path)
     try:
         command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
-        error = error_of(command, capsys, status=1)
+        error = run(command, status=1).err
     finally:
         path.chmod(mode)
     assert error.removeprefix("structgstream: ").startswith(said.format(place=path, folder=tmp_path))
     assert error.count("\n") == 1
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_what_is_printed_names_the_board_for_prepare(tmp_path: Path, run: Runner) -> None:
+    """The command that is shown, typed, is this board."""
+    given = ["--paper", "A0", "--squares", "9x6", "--square", "7.5cm", "--dictionary", "DICT_4X4_250"]
+    shown = re.search(r"--board (\S+)", run(["board", "-o", str(tmp_path / "new" / "b.pdf"), *given]).out)
+    assert (tmp_path / "new" / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert shown
+    assert parse_board(shown[1]) == Board(9, 6, 0.075, dictionary="DICT_4X4_250")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--squares", "7"], "COLUMNSxROWS"),
+        (["--squares", "5x5"], "looks alike when turned"),
+        (["--square", "0mm"], "0mm"),
+        (["--square", "nan"], "nan"),
+        (["--square", "900mm"], "A3"),
+        (["--dictionary", "DICT_9X9"], "DICT_9X9"),
+        (["--squares", "1x1"], "1 x 1"),
+        (["--paper", "B5"], "B5"),
+    ],
+)
+def test_what_is_no_board(tmp_path: Path, given: list[str], words: str, run: Runner) -> None:
+    assert words in run(["board", "-o", str(tmp_path / "b.pdf"), *given], status=2).err
+    assert not (tmp_path / "b.pdf").exists()

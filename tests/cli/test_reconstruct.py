@@ -13,7 +13,7 @@ from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.session.loop import FrameReport
 from structgstream.training.parameters import RoundingConfig
-from tests.support.quick_streams import CLIP, QUARTER, QUICK, SMALL, error_of
+from tests.support.quick_streams import CLIP, QUARTER, QUICK, SMALL, Runner
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
 
@@ -30,20 +30,17 @@ def test_reconstruct_writes_the_log_beside_the_stream(stream: Path) -> None:
     assert {entry["peak_memory_kind"] for entry in entries} <= {"stage", "process"}
 
 
-def test_a_rig_that_is_not_the_papers_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_that_is_not_the_papers_is_reported(tmp_path: Path, run: Runner) -> None:
     asked = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--frames", "1", "--scale", "0.25", *QUICK]
-    assert main([*asked, "--preset", "paper-meetroom"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    said = " ".join(run([*asked, "--preset", "paper-meetroom"]).out.split())
     assert "The paper's data of paper-meetroom are others: pictures of 80x60 instead of 1280x720;" in said
 
 
-def test_few_cameras_are_told_at_the_start_what_to_expect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_few_cameras_are_told_at_the_start_what_to_expect(tmp_path: Path, run: Runner) -> None:
     asked = ["reconstruct", CLIP, "--frames", "1", "--scale", "0.25", *QUICK, "-o"]
-    assert main([*asked, str(tmp_path / "s.sgs")]) == 0
-    assert "degrees apart" not in capsys.readouterr().out
+    assert "degrees apart" not in run([*asked, str(tmp_path / "s.sgs")]).out
     most = ["cam00", "cam02", "cam03", "cam04"]
-    assert main([*asked, str(tmp_path / "few.sgs"), "--held-out", *most]) == 0
-    first, second, *_ = capsys.readouterr().out.splitlines()
+    first, second, *_ = run([*asked, str(tmp_path / "few.sgs"), "--held-out", *most]).out.splitlines()
     assert "2 training cameras" in first
     assert second.startswith("Warning: 2 cameras, about 59 degrees apart: expect 19 to 24 dB at ")
     assert "at viewpoints between them, where people and objects may be torn (" in second
@@ -59,23 +56,23 @@ def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
     assert header.config["rate"] == {"target_mbits": 0.5}
 
 
-def test_an_existing_stream_is_not_replaced_by_accident(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_existing_stream_is_not_replaced_by_accident(stream: Path, run: Runner) -> None:
     before = stream.read_bytes()
-    error = error_of(["reconstruct", CLIP, "-o", str(stream), *SMALL, *QUICK], capsys, status=1)
+    error = run(["reconstruct", CLIP, "-o", str(stream), *SMALL, *QUICK], status=1).err
     assert "--resume" in error
     assert "--overwrite" in error
     assert stream.read_bytes() == before
 
 
-def test_resuming_with_another_configuration_changes_nothing(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resuming_with_another_configuration_changes_nothing(stream: Path, run: Runner) -> None:
     before = stream.read_bytes()
     arguments = ["reconstruct", CLIP, "-o", str(stream), *SMALL, *QUICK, "--resume", "--online.losses.ssim", "0.3"]
-    assert "online.losses.ssim" in error_of(arguments, capsys, status=1)
+    assert "online.losses.ssim" in run(arguments, status=1).err
     assert stream.read_bytes() == before
 
 
 def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
-    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Runner
 ) -> None:
     def interrupted(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
         if report.index == 1:
@@ -85,7 +82,7 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
     arguments = ["reconstruct", CLIP, "-o", str(path), *SMALL, *QUICK]
     with monkeypatch.context() as patch:
         patch.setattr(Lines, "frame", interrupted)
-        error = error_of(arguments, capsys, status=130)
+        error = run(arguments, status=130).err
     assert "again.sgs" in error
     assert "--resume" in error
     assert path.stat().st_size < stream.stat().st_size
@@ -94,15 +91,15 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
     assert len(path.with_suffix(".log.jsonl").read_text().splitlines()) == 3
 
 
-def test_every_second_frame_is_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Which frames it is scored against: evaluation/test_capture.py."""
+def test_every_second_frame_is_resumed(tmp_path: Path, run: Runner) -> None:
+    """Which frames it is scored against: evaluation/test_recording.py."""
     path, whole = tmp_path / "half.sgs", tmp_path / "whole.sgs"
     base = ["reconstruct", CLIP, *QUARTER, "--start", "1", "--every", "2"]
     assert main([*base, "-o", str(whole), "--frames", "2"]) == 0
     first = open_stream(whole).packets[0]
     path.write_bytes(whole.read_bytes()[: first.offset + first.bytes])
     for other in (["--every", "3"], ["--every", "1"]):
-        error = error_of([*base, *other, "-o", str(path), "--frames", "2", "--resume"], capsys, status=1)
+        error = run([*base, *other, "-o", str(path), "--frames", "2", "--resume"], status=1).err
         assert "every, fps differ" in error
     assert main([*base, "-o", str(path), "--frames", "2", "--resume"]) == 0
     assert path.read_bytes() == whole.read_bytes()
@@ -142,19 +139,18 @@ def test_every_second_frame_is_resumed(tmp_path: Path, capsys: pytest.CaptureFix
     ],
 )
 def test_wrong_options_are_reported_before_anything_is_written(
-    tmp_path: Path, extra: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, extra: list[str], status: int, words: str, run: Runner
 ) -> None:
     out = tmp_path / "new.sgs"
-    assert words in error_of(["reconstruct", CLIP, "-o", str(out), *extra], capsys, status=status)
+    assert words in run(["reconstruct", CLIP, "-o", str(out), *extra], status=status).err
     assert not out.exists()
 
 
 @pytest.mark.parametrize("given", [["--preset", "fast"], ["--preset=fast"], ["--preset", "rig", "--preset=fast"]])
-def test_the_configuration_has_help_of_its_own(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_configuration_has_help_of_its_own(given: list[str], run: Runner) -> None:
     from structgstream.session.presets import DEFAULT_PRESET, PRESETS
 
-    assert main(["reconstruct", *given, "--help-config"]) == 0
-    head, _, *lines = capsys.readouterr().out.splitlines()
+    head, _, *lines = run(["reconstruct", *given, "--help-config"]).out.splitlines()
     assert "'fast'" in head
     assert len(lines) <= 100, "two screens"
     assert all(re.match(r"--[a-z0-9.-]+ \S.* {2,}\S", line) for line in lines), "option, value and sentence"
@@ -164,22 +160,21 @@ def test_the_configuration_has_help_of_its_own(given: list[str], capsys: pytest.
 
 
 @pytest.mark.parametrize("given", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
-def test_a_wrong_preset_has_no_help(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    error = error_of(["reconstruct", "--help-config", *given], capsys, status=2)
+def test_a_wrong_preset_has_no_help(given: list[str], run: Runner) -> None:
+    error = run(["reconstruct", "--help-config", *given], status=2).err
     assert error.count("\n") == 1
     assert "preset" in error
 
 
-def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_presets_named_in_help_are_those_there_are(run: Runner) -> None:
     from structgstream.session.presets import PRESETS
 
-    assert main(["reconstruct", "--help"]) == 0
-    text = capsys.readouterr().out
+    text = run(["reconstruct", "--help"]).out
     assert all(name in text for name in PRESETS)
 
 
 def test_the_check_before_the_first_frame_sees_a_folder_without_permission(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Runner
 ) -> None:
     monkeypatch.setattr(recorder.os, "access", lambda path, mode: False)  # root may write anywhere
-    assert "permission" in error_of(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], capsys, status=1)
+    assert "permission" in run(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], status=1).err

@@ -17,7 +17,7 @@ from structgstream.codec.sinks import FileSink
 from structgstream.evaluation.camera_path import central_camera
 from tests.support.backends import QUICKEST
 from tests.support.drawn import pixels_of
-from tests.support.quick_streams import CLIP, error_of
+from tests.support.quick_streams import CLIP, Runner
 from tests.support.streams import header_for, small_scene, small_stream, write_stream
 
 
@@ -61,10 +61,8 @@ def test_render_beside_the_truth(stream: Path, tmp_path: Path) -> None:
         *((["--path", "orbit", "--seconds", text], "above 0") for text in ("0", "-3", "nan", "inf", "1e9")),
     ],
 )
-def test_render_refuses_what_does_not_go_together(
-    stream: Path, extra: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert words in error_of(["render", str(stream), *extra, "--device", QUICKEST], capsys, status=2)
+def test_render_refuses_what_does_not_go_together(stream: Path, extra: list[str], words: str, run: Runner) -> None:
+    assert words in run(["render", str(stream), *extra, "--device", QUICKEST], status=2).err
 
 
 @pytest.mark.parametrize(
@@ -107,32 +105,32 @@ def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> 
         assert render.default_output(options, reader) == Path("videos") / name
 
 
-def test_a_stream_without_frames_is_not_rendered_nor_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stream_without_frames_is_not_rendered_nor_scored(tmp_path: Path, run: Runner) -> None:
     empty = tmp_path / "empty.sgs"
     write_stream(FileSink(empty), [], header=header_for(small_scene()))
     for more in ([], ["--path", "orbit"], ["--frame", "0"]):
-        assert "no whole frame" in error_of(["render", str(empty), *more], capsys, status=2)
-    assert "no whole frame, so there is nothing to score" in error_of(["evaluate", str(empty), CLIP], capsys, status=2)
+        assert "no whole frame" in run(["render", str(empty), *more], status=2).err
+    assert "no whole frame, so there is nothing to score" in run(["evaluate", str(empty), CLIP], status=2).err
 
 
-def test_lost_frames_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_frames_are_left_out(tmp_path: Path, run: Runner) -> None:
     """As they are in a stream with a window; here packets are damaged, and no index is whole."""
     data = bytearray(small_stream(frames=5)[:-1])
     for lost in (0, 2):
         data[StreamReader(bytes(data)).packets.at(lost).offset + 20] ^= 1
     (tmp_path / "late.sgs").write_bytes(data)
     base = ["render", str(tmp_path / "late.sgs"), "--device", QUICKEST]
-    assert main([*base, "-o", str(tmp_path / "all")]) == 0
+    left_out = "The stream has frames 1 to 1 and 3 to 4; those that are lost are left out."
+    assert left_out in run([*base, "-o", str(tmp_path / "all")]).err
     assert sorted(entry.name for entry in (tmp_path / "all").iterdir()) == [f"0000{i}.png" for i in (1, 3, 4)]
-    assert "The stream has frames 1 to 1 and 3 to 4; those that are lost are left out." in capsys.readouterr().err
     assert main([*base, "-o", str(tmp_path / "3.png"), "--frame", "3"]) == 0
     assert (tmp_path / "3.png").read_bytes() == (tmp_path / "all" / "00003.png").read_bytes()
     for path in ([], ["--path", "orbit", "--seconds", "0.1"]):
         assert main([*base, "-o", str(tmp_path / "v.mp4"), *path]) == 0
         with av.open(str(tmp_path / "v.mp4")) as container:
             assert [round(30 * one.time) for one in container.decode(video=0)] == [0, 1, 2]
-    assert "frames 1 to 1 and 3 to 4; there is no frame 0" in error_of([*base, "--frame", "0"], capsys, status=2)
-    compared = error_of([base[0], base[1], CLIP, "--compare"], capsys, status=2)
+    assert "frames 1 to 1 and 3 to 4; there is no frame 0" in run([*base, "--frame", "0"], status=2).err
+    compared = run([base[0], base[1], CLIP, "--compare"], status=2).err
     assert "before the first lost one, which is frame 0" in compared
 
 

@@ -24,7 +24,7 @@ from structgstream.data.sound import SoundFile
 from structgstream.data.timeline import Clock
 from structgstream.recorder import SoundSink
 from tests.support.backends import QUICKEST
-from tests.support.quick_streams import CLIP, QUARTER, error_of
+from tests.support.quick_streams import CLIP, QUARTER, Runner
 from tests.support.sounds import APART_SECONDS, LOUD, add_sound, claps, stream_heard, write_sound
 from tests.vectors.generate import SOUND_STREAM
 
@@ -73,16 +73,14 @@ def test_without_sound_there_is_no_byte_more(capture: Path, tmp_path: Path, stre
             assert [*reader.group(index)][-1] == [*heard.group(index)][-1], "pictures do not depend on sound"
 
 
-def test_sound_is_added_to_a_stream_that_has_none(
-    capture: Path, tmp_path: Path, stream: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sound_is_added_to_a_stream_that_has_none(capture: Path, tmp_path: Path, stream: Path, run: Runner) -> None:
     silent, heard = made(Path(CLIP), tmp_path / "silent.sgs"), tmp_path / "heard.sgs"
     arguments = ["add-sound", str(silent), str(capture), "-o", str(heard)]
     assert main([*arguments, "--sound", "cam03"]) == 0
     assert heard.read_bytes() == stream.read_bytes()
-    assert "exists; replace it with --overwrite" in error_of(arguments, capsys, status=2)
+    assert "exists; replace it with --overwrite" in run(arguments, status=2).err
     again = ["add-sound", str(heard), str(capture), "-o", str(tmp_path / "x.sgs"), "--sound", "cam03"]
-    assert "heard.sgs has sound; take a stream without it" in error_of(again, capsys, status=1)
+    assert "heard.sgs has sound; take a stream without it" in run(again, status=1).err
     assert main([*arguments[:-1], str(tmp_path / "y.sgs"), "--sound", "cam04"]) == 0
     with open_stream(tmp_path / "y.sgs") as reader:
         assert stream_heard(reader) == pytest.approx([0.1], abs=MILLISECOND)
@@ -112,7 +110,6 @@ def test_a_part_of_the_capture_is_in_step(capture: Path, tmp_path: Path) -> None
         capture, tmp_path / "part.sgs", preset="tiny", backend=QUICKEST, scale=0.25, start=2, frames=2, sound="cam04"
     )
     with open_stream(tmp_path / "part.sgs") as reader:
-        assert reader.header.sound is not None
         assert reader.header.sound.channels == 2
         assert stream_heard(reader) == pytest.approx([0.1 - 2 / 30], abs=MILLISECOND)
 
@@ -128,14 +125,12 @@ def test_it_continues_where_it_was_killed(capture: Path, tmp_path: Path, stream:
         assert path.read_bytes() == whole
 
 
-def test_another_sound_does_not_continue_it(
-    capture: Path, tmp_path: Path, stream: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_sound_does_not_continue_it(capture: Path, tmp_path: Path, stream: Path, run: Runner) -> None:
     path = tmp_path / "cut.sgs"
     path.write_bytes(stream.read_bytes()[:-200])
     for more in ([], ["--sound", "cam04"]):
         arguments = ["reconstruct", str(capture), "-o", str(path), "--frames", str(FRAMES), *QUARTER, "--resume", *more]
-        assert "another part of it: sound differ" in error_of(arguments, capsys, status=1)
+        assert "another part of it: sound differ" in run(arguments, status=1).err
 
 
 def test_segments_are_the_file_also_in_qualities(capture: Path, tmp_path: Path, stream: Path) -> None:
@@ -168,10 +163,10 @@ def test_segments_are_the_file_also_in_qualities(capture: Path, tmp_path: Path, 
     ],
 )
 def test_what_cannot_be_heard(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], status: int, words: str
+    capture: Path, tmp_path: Path, run: Runner, more: list[str], status: int, words: str
 ) -> None:
     arguments = ["reconstruct", str(capture), "-o", str(tmp_path / "x.sgs"), *QUARTER, *more]
-    assert words in " ".join(error_of(arguments, capsys, status=status).split())
+    assert words in " ".join(run(arguments, status=status).err.split())
     assert not (tmp_path / "x.sgs").exists()
 
 
@@ -188,15 +183,15 @@ def in_video(path: Path) -> tuple[list[float], list[float]]:
     return heard, [at for (_, before), (at, now) in pairwise(light) if now > 100 >= before]
 
 
-def test_a_rendered_video_has_the_clap_with_its_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rendered_video_has_the_clap_with_its_picture(tmp_path: Path, run: Runner) -> None:
     video = tmp_path / "v.mp4"
-    assert main(["render", str(SOUND_STREAM), "-o", str(video), "--device", QUICKEST]) == 0
+    render_it = ["render", str(SOUND_STREAM), "-o", str(video), "--device", QUICKEST]
+    assert "no sound" not in run(render_it).err
     heard, seen = in_video(video)
     assert len(heard) == len(seen) == 1
     assert heard == pytest.approx(seen, abs=MOST_SECONDS / 4)
-    assert "no sound" not in capsys.readouterr().err
-    assert main(["render", str(SOUND_STREAM), "-o", str(video), "--path", "orbit", "--device", QUICKEST]) == 0
-    assert "The video has no sound, because it does not show the stream as it is." in capsys.readouterr().err
+    error = run([*render_it, "--path", "orbit"]).err
+    assert "The video has no sound, because it does not show the stream as it is." in error
     with av.open(str(video)) as container:
         assert not container.streams.audio
 

@@ -54,7 +54,6 @@ def seeded(trunk: Trunk) -> nn.Sequential:
     for module in net:
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-            assert module.bias is not None
             nn.init.normal_(module.bias, std=0.1)
     return net
 
@@ -98,15 +97,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def loaded(trunk: Trunk, folder: Path) -> Lpips:
-    path = weights_file(trunk, folder)
-    assert path is not None
-    return load_lpips(trunk, path, CPU)
-
-
-@pytest.fixture(autouse=True)
-def no_weights_elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv(ENVIRONMENT, raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
+    return load_lpips(trunk, weights_file(trunk, folder), CPU)
 
 
 @pytest.mark.parametrize("trunk", TRUNKS, ids=["alex", "vgg"])

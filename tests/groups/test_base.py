@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What groups share is the beginning of any stream with scene flow."""
+"""What groups share: the beginning of any stream with scene flow, and the capture of the header, or none."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sound import SoundFormat
-from structgstream.errors import ConfigError, StreamError
-from structgstream.groups.base import GroupBase
+from structgstream.errors import CaptureError, ConfigError, StreamError
+from structgstream.groups.base import GroupBase, fingerprint, open_for
 from structgstream.groups.join import join_segments
-from tests.support.clip_groups import made
+from tests.support.clip_groups import CAPTURE, made
 from tests.support.streams import same, small_stream
 
 
@@ -37,3 +38,30 @@ def test_streams_that_cannot_begin_groups_are_refused(tmp_path: Path) -> None:
     heard = replace(base, header=replace(base.header, sound=SoundFormat(1)))
     with pytest.raises(ConfigError, match="has sound, which groups do not carry; make it with --sound none"):
         _ = heard.config
+
+
+def test_it_is_opened_as_the_header_says() -> None:
+    header = GroupBase.read(made().header).header
+    source = open_for(header, CAPTURE, frames=3)
+    assert len(source) == 3
+    assert source.rig.held_out == header.rig.held_out
+    assert {(source.rig[name].width, source.rig[name].height) for name in source.rig} == {(80, 60)}
+
+
+def test_another_capture_is_refused_by_its_cameras() -> None:
+    header = GroupBase.read(made().header).header
+    first = header.rig["cam00"]
+    longer = first.K * torch.tensor([[1.1, 1.0, 1.0]] * 3, dtype=torch.float64)
+    moved = header.rig.mapped({**header.rig.cameras, "cam00": replace(first, K=longer)})
+    with pytest.raises(CaptureError, match="not the one of the header: cam00 differs"):
+        open_for(replace(header, rig=moved), CAPTURE, frames=3)
+    with pytest.raises(CaptureError, match="has 12 frames, but 99 are needed"):
+        open_for(header, CAPTURE, frames=99)
+
+
+def test_the_fingerprint_is_of_calibration_split_and_pictures() -> None:
+    header = GroupBase.read(made().header).header
+    one = fingerprint(open_for(header, CAPTURE, frames=3))
+    assert one == fingerprint(open_for(header, CAPTURE, frames=6))
+    other = replace(header, rig=header.rig.with_held_out(frozenset({"cam01"})))
+    assert fingerprint(open_for(other, CAPTURE, frames=3)) != one

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Static content continues from group to group, exactly, for as long as it is static."""
+"""Static content continues from group to group; what moves, or would show as a mixture, is the group's own."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,11 +8,24 @@ import pytest
 import torch
 from torch import Tensor
 
+from structgstream import cameras
+from structgstream.cameras import CameraRig
 from structgstream.codec.fields.quantization import dequantize, quantize
-from structgstream.groups.seam_blend import FADE_FRAMES, NEIGHBOURS, SeamBlend
+from structgstream.groups.base import GroupBase
+from structgstream.groups.seam_blend import (
+    FADE_FRAMES,
+    NEIGHBOURS,
+    SeamBlend,
+    draw_border,
+    moving_at_border,
+    visible_mixtures,
+)
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
+from structgstream.training.online.measure import primitive_sums, slot_count
 from structgstream.training.online.patching import IDS_PER_FRAME
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import made
 from tests.support.streams import STEPS, small_scene
 
 SIDE = 2 * NEIGHBOURS
@@ -39,8 +52,7 @@ def on_bins(values: Tensor) -> Tensor:
 
 
 def shifted(scene: Scene, rows: Tensor, bins: int) -> Scene:
-    positions = scene.anchors.positions + bins * STEP * rows[:, None]
-    return replace(scene, anchors=replace(scene.anchors, positions=positions))
+    return displaced(scene, rows, bins * STEP)
 
 
 def born_in(scene: Scene, frame: int) -> Scene:
@@ -160,3 +172,91 @@ def test_free_gaussians_are_the_groups_own_at_once(moving: Tensor) -> None:
     shown = SeamBlend(before, own, moving, steps=STEPS).scene(own)
     assert torch.equal(shown.free.births, own.free.births)
     assert torch.equal(shown.free.means, own.free.means)
+
+
+def most_seen(scene: Scene, rig: CameraRig) -> int:
+    """The anchor that covers most of the pictures."""
+    backend, cameras = quickest_backend(), [rig[name] for name in rig.training]
+    viewports = [camera.viewport(scene.anchors.positions) for camera in cameras]
+    maps = torch.ones(len(cameras), cameras[0].height, cameras[0].width, 1)
+    gaussians = scene.gaussians_of_views(cameras, backend)
+    sums = backend.weigh_views(gaussians, viewports, maps, slots=slot_count(scene))
+    return int(primitive_sums(sums.sum(0), scene)[: len(scene.anchors)].argmax())
+
+
+def moving(before: Scene, first: Scene, rig: CameraRig, **around: Scene) -> Tensor | None:
+    backend = quickest_backend()
+    return moving_at_border(before, first, draw_border(before, first, rig, backend), rig, backend, **around)
+
+
+def test_what_moved_is_found_and_what_did_not_is_not(base: tuple[Scene, CameraRig]) -> None:
+    first, rig = base
+    at = first.anchors.positions
+    center = at[most_seen(first, rig)]
+    there = (at - center).norm(dim=1) < (at - center).norm(dim=1).quantile(0.1)
+    before = displaced(first, there)
+    found = moving(first, first, rig)
+    assert not found.any()
+    found = moving(before, first, rig)
+    # Pictures of 80x60 show few of the anchors in a heap.
+    assert found[there].float().mean() > 3.0 * found[~there].float().mean()
+    slowly = displaced(first, there, 1e-4)
+    for around in ({"second": slowly}, {"earlier": slowly}):
+        found = moving(first, first, rig, **around)
+        assert torch.equal(found, there)
+
+
+def test_at_a_cut_nothing_is_handed_over(base: tuple[Scene, CameraRig]) -> None:
+    first, rig = base
+    gone = replace(first, anchors=replace(first.anchors, positions=first.anchors.positions + 50.0))
+    assert moving(gone, first, rig, second=first) is None
+
+
+@pytest.fixture(scope="module")
+def base() -> tuple[Scene, CameraRig]:
+    found = GroupBase.read(made().header)
+    return found.scene(), found.header.similarity.rig(found.header.rig)
+
+
+def middle(scene: Scene) -> Tensor:
+    """The tenth of the anchors that is nearest to their centre."""
+    apart = (scene.anchors.positions - scene.anchors.positions.median(0).values).norm(dim=1)
+    return apart < apart.quantile(0.1)
+
+
+def displaced(scene: Scene, rows: Tensor, by: float = 0.3) -> Scene:
+    positions = scene.anchors.positions + by * rows[:, None]
+    return replace(scene, anchors=replace(scene.anchors, positions=positions))
+
+
+def test_what_either_frame_shows_is_no_mixture(base: tuple[Scene, CameraRig]) -> None:
+    scene, rig = base
+    backend = quickest_backend()
+    assert not visible_mixtures(scene, draw_border(scene, scene, rig, backend), rig, backend).any()
+    other = displaced(scene, middle(scene))
+    assert not visible_mixtures(scene, draw_border(other, scene, rig, backend), rig, backend).any()
+
+
+def test_what_neither_frame_shows_is_found_where_it_is(base: tuple[Scene, CameraRig]) -> None:
+    scene, rig = base
+    there = middle(scene)
+    backend = quickest_backend()
+    found = visible_mixtures(displaced(scene, there), draw_border(scene, scene, rig, backend), rig, backend)
+    assert found[there].float().mean() > 2.0 * found[~there].float().mean() > 0.0
+
+
+def test_what_shows_is_the_same_in_larger_pictures(
+    base: tuple[Scene, CameraRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coverage is measured at one size, so that specks count in large pictures as they do in small ones."""
+    scene, rig = base
+    there, backend = middle(scene), quickest_backend()
+    sides = max(max(rig[name].width, rig[name].height) for name in rig)
+    large = replace(rig, cameras={name: rig[name].resized(2 * rig[name].width, 2 * rig[name].height) for name in rig})
+    monkeypatch.setattr(cameras, "REFERENCE_PIXELS", sides)
+    found = [
+        visible_mixtures(displaced(scene, there), draw_border(scene, scene, of, backend), of, backend)
+        for of in (rig, large)
+    ]
+    other = (found[0] != found[1]).float().mean() / found[0].float().mean()
+    assert float(other) < 0.3  # 0.62 if coverage is in pixels of each size.

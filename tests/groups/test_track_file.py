@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a tracking pass."""
+"""The file of a tracking pass: its starts, its list of groups, and where groups begin."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.atomic_files import partial_path
-from structgstream.errors import StreamError
-from structgstream.groups.track_file import PREFIX, SIGNATURE, TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.errors import ConfigError, StreamError
+from structgstream.groups.track_file import (
+    PREFIX,
+    SIGNATURE,
+    TrackHead,
+    TrackStart,
+    TrackWriter,
+    check_length,
+    equal_groups,
+    groups_path,
+    open_track,
+    quiet_groups,
+    read_groups,
+    write_groups,
+)
 from tests.support.killed import folders_of_the_killed
+from tests.support.properties import examples
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 
@@ -95,13 +110,87 @@ def test_a_cut_or_damaged_track_says_so(tmp_path: Path) -> None:
 
 
 def test_what_is_no_track_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "t"
-    path.write_bytes(b"")
-    with pytest.raises(StreamError, match="is no track"):
-        open_track(path)
-    path.write_bytes(PREFIX.pack(SIGNATURE, 9, 0))
-    with pytest.raises(StreamError, match="version 9"):
-        open_track(path)
-    path.write_bytes(PREFIX.pack(SIGNATURE, 1, 0) + b"xx")
-    with pytest.raises(StreamError, match="is damaged"):
-        open_track(path)
+    path, prefix = tmp_path / "t", PREFIX.pack(SIGNATURE, 1, 0)
+    other = PREFIX.pack(SIGNATURE, 9, 0)
+    for data, said in ((b"", "is no track"), (other, "version 9"), (prefix + b"xx", "is damaged")):
+        path.write_bytes(data)
+        with pytest.raises(StreamError, match=said):
+            open_track(path)
+
+
+@examples(60)
+@given(st.lists(st.integers(1, 90), min_size=1, max_size=9), st.data())
+def test_groups_come_back_and_those_that_do_not_follow_each_other_do_not(
+    tmp_path_factory: pytest.TempPathFactory, lengths: list[int], choice: st.DataObject
+) -> None:
+    track = tmp_path_factory.mktemp("groups") / "track"
+    borders = [0, *(sum(lengths[: i + 1]) for i in range(len(lengths)))]
+    groups = [*pairwise(borders)]
+    write_groups(track, groups)
+    assert read_groups(track) == groups
+    number = choice.draw(st.integers(0, len(groups) - 1))
+    shift = choice.draw(st.integers(1, 5))
+    first, end = groups[number]
+    wrong = choice.draw(st.sampled_from([(first + shift, end), (first - shift, end), (first, first)]))
+    groups[number] = wrong
+    write_groups(track, groups)
+    with pytest.raises(StreamError, match="do not follow each other from frame 0 on"):
+        read_groups(track)
+
+
+def test_undecided_groups_are_none(tmp_path: Path) -> None:
+    assert read_groups(tmp_path / "track") is None
+    for text in ("", "0:4", "0:4\n4:"):
+        groups_path(tmp_path / "track").write_text(text)
+        assert read_groups(tmp_path / "track") is None
+
+
+@pytest.mark.parametrize("text", [b"\n", b"four\n", b"0:4 4\n", b"0-4\n", b"\xff\xfe\n", b"0:4\n8:12\n", b"4:8\n"])
+def test_what_are_no_groups_is_reported(tmp_path: Path, text: bytes) -> None:
+    groups_path(tmp_path / "track").write_bytes(text)
+    with pytest.raises(StreamError, match=r"track\.groups"):
+        read_groups(tmp_path / "track")
+
+
+@given(st.integers(1, 200), st.integers(1, 40))
+def test_equal_groups_have_every_frame_once(frames: int, length: int) -> None:
+    groups = equal_groups(frames, length)
+    assert [frame for first, end in groups for frame in range(first, end)] == [*range(frames)]
+    assert all(end - first == length for first, end in groups[:-1])
+    assert groups[-1][1] - groups[-1][0] in range(2, length + 2) or length == 1 or frames == 1
+
+
+def test_a_last_frame_by_itself_goes_to_the_group_before() -> None:
+    assert equal_groups(61, 30) == [(0, 30), (30, 61)]
+    assert equal_groups(62, 30) == [(0, 30), (30, 60), (60, 62)]
+    assert equal_groups(1, 30) == [(0, 1)]
+    assert equal_groups(3, 1) == [(0, 1), (1, 2), (2, 3)], "as was asked for"
+    assert quiet_groups(61, 30, {30: 0.1, 60: 0.0}) == [(0, 30), (30, 61)]
+
+
+@given(st.integers(1, 20), st.integers(1, 4), st.data())
+def test_quiet_groups_have_every_frame_once_and_begin_at_candidates(
+    units: int, every: int, data: st.DataObject
+) -> None:
+    frames = units * every
+    changed = {at: data.draw(st.floats(0, 1)) for at in range(every, frames, every)}
+    length = every * data.draw(st.integers(1, 4))
+    groups = quiet_groups(frames, length, changed)
+    assert [frame for first, end in groups for frame in range(first, end)] == [*range(frames)]
+    assert {first for first, _ in groups[1:]} <= changed.keys()
+    assert all(end - first <= length + length // 2 for first, end in groups)
+
+
+def test_borders_lie_where_little_moves() -> None:
+    changed = dict.fromkeys(range(10, 100, 10), 0.3) | {30: 0.01, 60: 0.02}
+    assert quiet_groups(100, 30, changed) == [(0, 30), (30, 60), (60, 100)]
+    shifted = dict.fromkeys(range(10, 100, 10), 0.3) | {20: 0.01, 60: 0.02}
+    assert quiet_groups(100, 30, shifted) == [(0, 20), (20, 60), (60, 100)]
+
+
+def test_a_length_off_the_key_packets_is_refused_with_the_nearest_that_is_on_them() -> None:
+    check_length(60, key_interval=30)
+    with pytest.raises(ConfigError, match="one every 30 frames .* take 60"):
+        check_length(50, key_interval=30)
+    with pytest.raises(ConfigError, match="Groups of 0 frames"):
+        check_length(0, key_interval=30)

@@ -68,7 +68,6 @@ def test_quiet_groups_begin_at_starts(tmp_path: Path) -> None:
     path = tmp_path / "track"
     assert track(path, made().header, options=replace(OPTIONS, length=2, quiet=True)) == FRAMES - 1
     found = open_track(path)
-    assert found.groups is not None
     assert {first for first, _ in found.groups[1:]} <= set(found.starts)
     assert found.groups[-1][1] == FRAMES
 

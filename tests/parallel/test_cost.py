@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model against runs that are reckoned by hand, and what must hold for all."""
+"""The model against runs that are reckoned by hand, what must hold for all, and costs from notes and logs."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
+from structgstream.executors.tasks import TaskResult
 from structgstream.parallel.cost import (
     Costs,
     Work,
     estimate,
+    measured_in,
     sequential_seconds,
     serial_seconds,
     stream_bytes,
     workers_for,
 )
+from structgstream.parallel.parts import Parts, group_name
+from tests.support.measured_runs import finished_run
 from tests.support.properties import examples
 
 COSTS = Costs(
@@ -89,3 +94,37 @@ def test_the_workers_for_a_finish_are_the_least_that_end_in_time(seconds: float)
 def test_nothing_less_than_one_is_planned() -> None:
     with pytest.raises(ConfigError, match="group must be 1 or more, got 0"):
         Work(10, 0, 10)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return finished_run(tmp_path)
+
+
+def test_costs_are_those_that_went_in(folder: Path) -> None:
+    found = measured_in(folder)
+    costs = found.costs
+    assert (found.frames, found.groups) == (12, 2)
+    assert (costs.header_seconds, costs.track_start_seconds, costs.frame_seconds) == (30.0, 3.0, 2.0)
+    assert costs.track_seconds == pytest.approx(0.5)
+    assert (costs.process_seconds, costs.first_seconds) == (3.0, pytest.approx(7.0))
+    assert (costs.join_start_seconds, costs.join_seconds) == (3.0, pytest.approx(0.1))
+    assert (costs.header_bytes, costs.first_bytes, costs.frame_bytes) == (1000, 50, 10)
+    assert costs.key_bytes == 50
+    assert costs.worker_bytes == 7000
+
+
+def test_a_group_that_was_killed_is_not_measured(folder: Path) -> None:
+    parts = Parts(folder)
+    parts.segment(4, 8).write_bytes(b"again")
+    parts.record(TaskResult(group_name(4, 8), 0, 1.0, attempts=2), "", parts.segment(4, 8), frames=4)
+    assert measured_in(folder).groups == 1
+
+
+def test_a_run_that_is_not_finished_is_reported(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no finished parallel run"):
+        measured_in(tmp_path / "nothing")
+    lines = (folder / "done.jsonl").read_text().splitlines(keepends=True)
+    (folder / "done.jsonl").write_text("".join(line for line in lines if "000008" not in line))
+    with pytest.raises(ConfigError, match="no finished parallel run"):
+        measured_in(folder)

@@ -150,7 +150,6 @@ def test_the_list_the_logs_and_the_metrics(tmp_path: Path) -> None:
     metrics = RunMetrics(folder, fps=30.0, qualities=NAMES)
     run, source = begun(folder, Recorded(count=7), metrics=metrics), []
     expected = read_list(folder)
-    assert expected is not None
     assert [(one.name, one.manifest) for one in expected] == [(name, f"{name}/manifest.json") for name in NAMES]
     assert [one.bits_per_second for one in expected] == [0.5e6, 8e6], "before anything is known"
     assert not (folder / "low" / "manifest.json").exists()
@@ -159,7 +158,6 @@ def test_the_list_the_logs_and_the_metrics(tmp_path: Path) -> None:
         if one.whole and one.report.index < 5:
             assert read_list(folder) == expected
     measured = read_list(folder)
-    assert measured is not None
     sizes = {name: [one.report.bytes for one in source if one.quality == name] for name in NAMES}
     assert [one.bits_per_second for one in measured] == [round(8 * sum(sizes[name][1:]) / 1.5) for name in NAMES]
     values = json.loads((tmp_path / "out.metrics.json").read_text())
@@ -257,7 +255,6 @@ def test_a_run_that_is_left_closes_all_and_keeps_the_rates(tmp_path: Path) -> No
     rates = read_list(folder)
     again = begun(folder, Recorded(), resume=True)
     assert read_list(folder) == rates
-    assert rates is not None
     assert rates[0].bits_per_second != 0.5e6
     list(again.reports)
     assert [len(open_stream(folder / name)) for name in NAMES] == [FRAMES] * 2

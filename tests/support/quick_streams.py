@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of the bundled clip that take seconds, for tests of commands."""
 
+from typing import Any, Protocol
+
 import pytest
 
 from structgstream.cli import main
@@ -14,11 +16,26 @@ QUICK += ["--online.patching.iteration", "1"]
 QUARTER = ["--scale", "0.25", *QUICK]
 
 
+class Runner(Protocol):
+    """Runs a command, which ends with ``status``, and returns what it has printed: ``out`` and ``err``."""
+
+    def __call__(self, arguments: list[str], *, status: int = 0) -> Any: ...
+
+
+def runner_of(capsys: pytest.CaptureFixture[str]) -> Runner:
+    """Also checks that there is never a traceback, nor an error that nobody expected."""
+
+    def run(arguments: list[str], *, status: int = 0) -> Any:
+        capsys.readouterr()
+        assert main(arguments) == status
+        printed = capsys.readouterr()
+        assert "Traceback" not in printed.err
+        assert "unexpected error" not in printed.err
+        return printed
+
+    return run
+
+
 def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
-    """What a command that fails with ``status`` says; never a traceback, nor that nobody expected this."""
-    capsys.readouterr()
-    assert main(arguments) == status
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert "unexpected error" not in error
-    return error
+    """What a command that fails with ``status`` says."""
+    return runner_of(capsys)(arguments, status=status).err

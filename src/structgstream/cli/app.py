@@ -210,8 +210,8 @@ def _run(command: str, arguments: list[str]) -> None:
 
 def entry_of(command: str, package: str = "structgstream.cli") -> Callable[[list[str]], None]:
     """The function of a command of a package of commands."""
-    own = SHARED.get(command) if package == "structgstream.cli" else None
-    module, function = own.split(".") if own else (command.replace("-", "_"), "main")
+    usual = f"{command.replace('-', '_')}.main"
+    module, function = (SHARED.get(command, usual) if package == "structgstream.cli" else usual).split(".")
     return getattr(importlib.import_module(f"{package}.{module}"), function)
 
 
@@ -267,11 +267,8 @@ class StopSignal:
             _print_error("Ends after this frame; Ctrl-C again ends at once.")
 
 
-AGAIN_SECONDS = 3.0
-
-
 @contextmanager
-def interruptible(*, again_seconds: float = AGAIN_SECONDS) -> Iterator[None]:
+def interruptible(*, again_seconds: float = 3.0) -> Iterator[None]:
     """Within this block Ctrl-C is a ``KeyboardInterrupt`` that leaves it.
 
     Libraries lose it: one that is loaded at the moment makes an error of its own of it (pycolmap does), a callback from

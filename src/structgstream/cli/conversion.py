@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import (
@@ -15,13 +14,25 @@ from structgstream.cli.options import (
     Device,
     Flag,
     Folder,
+    Number,
     StreamFile,
+    StreamOutput,
     check_ending,
     check_new,
     parse_options,
+    shown_as,
 )
-from structgstream.cli.progress import frame_bar, frames_text, human_bytes, print_lines
-from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
+from structgstream.cli.progress import frame_bar, frames_text, human_bytes, plain_table, print_lines
+from structgstream.exporters.formats import (
+    FORMATS,
+    Format,
+    FrameOptions,
+    PageFormat,
+    SpzVersion,
+    check_page,
+    choose_frames,
+    destination,
+)
 
 
 @dataclass(frozen=True)
@@ -45,33 +56,30 @@ class Export:
     Example: structgstream export ball.sgs -o ball.usd
     """
 
-    stream: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="STREAM", help_behavior_hint="")]] = None
+    stream: tyro.conf.Positional[Annotated[Path | None, shown_as("STREAM")]] = None
     """The stream file."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
+    output: Annotated[Path | None, shown_as("OUT", "-o")] = None
     """Output file or folder. Default: a file (with --frame) or a folder next to the stream."""
-    format: Annotated[Format | PageFormat | None, tyro.conf.arg(help_behavior_hint="")] = None
+    format: Annotated[Format | PageFormat | None, shown_as()] = None
     """Format of the files. Default: the suffix of OUT, else ply."""
-    frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    frame: Number = None
     """Export only this frame."""
-    frames: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="FIRST LAST", help_behavior_hint="")] = None
+    frames: Annotated[tuple[int, int] | None, shown_as("FIRST LAST")] = None
     """First and last frame to export. Default: all."""
-    sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..3", help_behavior_hint="")] = None
+    sh_degree: Annotated[int | None, shown_as("0..3")] = None
     """Degree of the spherical harmonics. Default: 1; .splat has none."""
-    low_pass: Annotated[float, tyro.conf.arg(metavar="0..1", help_behavior_hint="")] = 0.0
+    low_pass: Annotated[float, shown_as("0..1")] = 0.0
     """Widen Gaussians by this variance, in squared training pixels, for viewers that show the scene larger than it was
     filmed (0.2) or have no low-pass of their own (0.3). Default: 0, best at the size of the training pictures."""
-    crop: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
-    ] = None
+    crop: Annotated[tuple[float, float, float, float, float, float] | None, shown_as("X0 Y0 Z0 X1 Y1 Z1")] = None
     """Leave out Gaussians outside this box: its lowest and its highest corner, in units of the capture."""
-    min_opacity: Annotated[float, tyro.conf.arg(metavar="0..1", help_behavior_hint="")] = 0.0
+    min_opacity: Annotated[float, shown_as("0..1")] = 0.0
     """Leave out Gaussians below this opacity."""
-    max_splats: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    max_splats: Number = None
     """Largest number of Gaussians of a frame; the smallest and most transparent are left out."""
     pad_sh: Flag = False
     """Write all 45 f_rest properties of a .ply, which some importers need."""
-    spz_version: Annotated[SpzVersion, tyro.conf.arg(help_behavior_hint="")] = 2
+    spz_version: Annotated[SpzVersion, shown_as()] = 2
     """Version of .spz: all readers know 2; 3 and 4 have finer rotations, 4 is compressed with zstd."""
     list: Flag = False
     """List the formats: what each is for, and what reads it."""
@@ -89,8 +97,6 @@ def export(arguments: list[str]) -> None:
         raise UsageError("export needs a stream file, or --list.")
     stream = options.stream
     check_ending(options.output, *EXPORTS, ".zip", ".html", command="export", folder=True)
-    from structgstream.exporters.formats import check_page, choose_frames, destination
-
     frame, frames = options.frame, options.frames
     chosen = FrameOptions(
         degree=options.sh_degree,
@@ -123,33 +129,26 @@ def export(arguments: list[str]) -> None:
             gaussians += written.gaussians
             loss = loss or written.loss
             advance()
-    size_bytes = sum(path.stat().st_size for path in files)
-    console = Console()
-    print_lines(
-        console, f"Wrote {output}: {frames_text(len(numbers))}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}"
-    )
+    size = human_bytes(sum(path.stat().st_size for path in files))
+    said = [f"Wrote {output}: {frames_text(len(numbers))}, {gaussians:,} Gaussians, {size}"]
     if loss is not None:
         held_out = "" if loss.held_out is None else f", {loss.held_out:.1f} dB at the held-out ones"
-        print_lines(
-            console,
+        said.append(
             f"Plain Gaussians of frame {numbers[0]}, against the stream's own pictures: PSNR {loss.training:.1f} dB at "
-            f"the training cameras{held_out}.",
+            f"the training cameras{held_out}."
         )
-    others = sorted(set(output.glob(f"frame_*.{format}")) - files) if output.is_dir() else []
-    if others:
-        print_lines(
-            console,
+    if output.is_dir() and (others := sorted(set(output.glob(f"frame_*.{format}")) - files)):
+        said.append(
             f"{output} also has {frames_text(len(others))} of an earlier export, such as {others[-1].name}; viewers "
-            "take all of them for one sequence.",
+            "take all of them for one sequence."
         )
     if reader.damage:
-        print_lines(console, f"The stream is damaged: {reader.cut_reason}.")
+        said.append(f"The stream is damaged: {reader.cut_reason}.")
+    print_lines(Console(), *said)
 
 
 def _list_formats(console: Console) -> None:
-    table = Table(box=None, pad_edge=False)
-    for title in ("format", "what for", "read by", "file", "SH degree"):
-        table.add_column(title, overflow="fold")
+    table = plain_table("format", "what for", "read by", "file", "SH degree", overflow="fold")
     for name, info in FORMATS.items():
         file = "all frames" if info.all_frames else "one frame"
         table.add_row(name, info.purpose, info.readers, file, f"0 to {info.max_degree}" if info.max_degree else "0")
@@ -162,17 +161,11 @@ def _export_page(path: Path, output: Path, format: PageFormat) -> None:
     from structgstream.serve.pages import StreamFile as ServedStream
     from structgstream.serve.pages import write_page, write_site
 
-    stream = ServedStream(path)
     if format == "html":
-        size_bytes = write_page(output, stream)
-        then = f"open it in a browser: {output.resolve().as_uri()}"
+        write, then = write_page, f"open it in a browser: {output.resolve().as_uri()}"
     else:
-        size_bytes = write_site(output, stream)
-        then = "put the folder on any web server"
-    print_lines(Console(), f"Wrote {output}, {human_bytes(size_bytes)}; {then}")
-
-
-UP = {"x": (-1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
+        write, then = write_site, "put the folder on any web server"
+    print_lines(Console(), f"Wrote {output}, {human_bytes(write(output, ServedStream(path)))}; {then}")
 
 
 @dataclass(frozen=True)
@@ -187,15 +180,15 @@ class Import:
 
     sequence: tyro.conf.Positional[Folder]
     """Folder of the files: frame_0000.ply and so on."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write."""
     fps: Annotated[float, tyro.conf.arg(metavar="N")] = 30.0
     """Frames per second."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    capture: Annotated[Path | None, shown_as("FOLDER")] = None
     """Capture in the units of the files, for its cameras. Default: a ring of cameras around the Gaussians."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
     """Axis that points up, for the ring."""
-    max_splats: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    max_splats: Number = None
     """Largest number of Gaussians of a frame; the smallest and most transparent are left out."""
     overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
@@ -221,7 +214,7 @@ def import_files(arguments: list[str]) -> None:
         raise UsageError(f"--max-splats {options.max_splats} is not one of 1 to {MAX_FREE}.")
     files = find_sequence(options.sequence)
     sign = -1.0 if options.up.startswith("-") else 1.0
-    x, y, z = UP[options.up[-1]]
+    x, y, z = (sign * (-1.0 if axis == options.up[-1] else 0.0) for axis in "xyz")
     with frame_bar("importing", len(files)) as advance:
         found = import_sequence(
             files,
@@ -229,39 +222,29 @@ def import_files(arguments: list[str]) -> None:
             fps=options.fps,
             backend=select_backend(options.device),
             rig=None if options.capture is None else open_capture(options.capture).rig,
-            down=(sign * x, sign * y, sign * z),
+            down=(x, y, z),
             max_splats=options.max_splats,
             on_frame=advance,
         )
-    console, size_bytes = Console(), output.stat().st_size
-    low, high = found.counts
+    size_bytes, (low, high) = output.stat().st_size, found.counts
     count = f"{high:,}" if low == high else f"{low:,} to {high:,}"
-    print_lines(
-        console,
+    said = [
         f"Wrote {output}: {frames_text(found.frames)} of {count} Gaussians, {human_bytes(size_bytes)}, "
-        f"{human_bytes(round(size_bytes / found.frames))} a frame",
-    )
+        f"{human_bytes(round(size_bytes / found.frames))} a frame"
+    ]
     if found.far:
-        print_lines(
-            console, f"Left out: up to {found.far:,} Gaussians of a frame that are too far away for the stream's steps."
-        )
+        said.append(f"Left out: up to {found.far:,} Gaussians of a frame that are too far away for the stream's steps.")
     if found.unread:
-        print_lines(console, f"Not read, since a plain Gaussian has no such thing: {', '.join(found.unread)}.")
-    print_lines(
-        console,
-        "All files have the same Gaussians; the stream contains their changes."
-        if found.linked
-        else "The files have different Gaussians, so every frame is stored by itself.",
-    )
-    colors = (
-        ""
-        if not found.degree
-        else (
-            f"; one colour a Gaussian in place of spherical harmonics of degree {found.degree} alone gives "
-            f"{found.color_psnr:.1f} dB"
-        )
-    )
-    print_lines(console, f"Pictures of frame 0 against those of the file: PSNR {found.psnr:.1f} dB{colors}.")
+        said.append(f"Not read, since a plain Gaussian has no such thing: {', '.join(found.unread)}.")
+    if found.linked:
+        said.append("All files have the same Gaussians; the stream contains their changes.")
+    else:
+        said.append("The files have different Gaussians, so every frame is stored by itself.")
+    pictures = f"Pictures of frame 0 against those of the file: PSNR {found.psnr:.1f} dB"
+    if found.degree:
+        pictures += f"; one colour a Gaussian in place of spherical harmonics of degree {found.degree} alone gives "
+        pictures += f"{found.color_psnr:.1f} dB"
+    print_lines(Console(), *said, f"{pictures}.")
 
 
 @dataclass(frozen=True)
@@ -275,7 +258,7 @@ class Archive:
 
     segments: tyro.conf.Positional[Folder]
     """The folder that reconstruct --sink segments has written."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write."""
     overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
@@ -305,11 +288,11 @@ class AddSound:
     """The stream."""
     capture: tyro.conf.Positional[Folder]
     """The capture that it was made from."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write."""
     sound: Annotated[str, tyro.conf.arg(metavar="CAMERA|FILE|auto")] = "auto"
     """As of reconstruct: the sound of a camera, of a file, or of the best microphone."""
-    sound_offset: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    sound_offset: Annotated[float | None, shown_as("SECONDS")] = None
     """As of reconstruct: when the file begins, in seconds after the first frame of the capture."""
     overwrite: Flag = False
     """Replace OUT.sgs when it exists."""

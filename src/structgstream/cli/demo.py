@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.evaluate import quality_text, report_tables
-from structgstream.cli.options import Device, check_ending, parse_known_options, resolve_config
+from structgstream.cli.options import Device, Number, PresetName, check_ending, parse_known_options, resolve_config
 from structgstream.cli.progress import print_lines
 
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
@@ -27,13 +27,13 @@ class Demo:
 
     output: Annotated[Path, tyro.conf.arg(metavar="FOLDER", aliases=["-o"])] = Path("demo")
     """Output folder; files of an earlier demo are replaced."""
-    frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    frames: Number = None
     """Number of frames. Default: all twelve."""
     scale: float = 1.0
     """Size of the pictures relative to the clip's."""
     device: Device = "auto"
     """Compute back-end."""
-    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    preset: PresetName = None
     """Preset of the configuration. Default: fast."""
 
 

@@ -13,12 +13,14 @@ from rich.text import Text
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import (
+    Cameras,
     Device,
     Folder,
     JsonPath,
     StreamFile,
     check_ending,
     parse_options,
+    shown_as,
     write_json_output,
 )
 from structgstream.cli.progress import (
@@ -53,17 +55,15 @@ class Evaluate:
     """The stream file."""
     scene: tyro.conf.Positional[Folder]
     """The capture that it was made from."""
-    cameras: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
-        None
-    )
+    cameras: Cameras = None
     """Cameras to score. Default: the held-out ones."""
     json: JsonPath = None
     """Write every number to this file, - is standard output (keys: docs/evaluation.md)."""
-    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    report: Annotated[Path | None, shown_as("FOLDER")] = None
     """Write report.json and a page of the worst frames, plots over time and a contact sheet into this folder."""
     metrics: Literal["all", "basic"] = "all"
     """Metrics: "basic" leaves out MS-SSIM, FLIP, LPIPS and temporal ones, which take longer than rendering."""
-    lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None
+    lpips_weights: Annotated[Path | None, shown_as("PATH")] = None
     """Folder or file with the networks' weights for LPIPS. Default: $STRUCTGSTREAM_LPIPS_WEIGHTS, torch's hub cache."""
     device: Device = "auto"
     """Back-end that renders."""
@@ -249,10 +249,6 @@ def _not_available(report: "Report") -> Table:
     return table
 
 
-def _at_equal_shares(drift: float | None) -> str:
-    return "" if drift is None else f" ({drift:+.3f} if as many pixels had changed in all)"
-
-
 def _facts(report: "Report") -> Table:
     s = report.stream
     table = name_value_table()
@@ -262,19 +258,19 @@ def _facts(report: "Report") -> Table:
     if s["masked_share"]:
         shares = (f"{name} {share:.1%}" for name, share in s["masked_share"].items())
         table.add_row("masked", Text(f"{', '.join(shares)} of the pixels, which are not scored"))
+    equal = s["drift_at_equal_shares_db_per_frame"]
+    at_equal_shares = "" if equal is None else f" ({equal:+.3f} if as many pixels had changed in all)"
     table.add_row(
         "PSNR over time",
         f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
-        f"drift {s['drift_db_per_frame']:+.3f} dB a frame{_at_equal_shares(s['drift_at_equal_shares_db_per_frame'])}",
+        f"drift {s['drift_db_per_frame']:+.3f} dB a frame{at_equal_shares}",
     )
-    if s["worst"]["changed"]:
-        found = s["worst"]["changed"]
+    if found := s["worst"]["changed"]:
         table.add_row(
             "worst frame",
             Text(f"{found['frame']} of {found['camera']}: {found['psnr_changed']:.2f} dB on changed pixels"),
         )
-    if s["worst"]["ghosts"]:
-        found = s["worst"]["ghosts"]
+    if found := s["worst"]["ghosts"]:
         pixels = 100 * found["ghost_share"] * found["disoccluded_share"]
         table.add_row(
             "most ghosts",
@@ -302,8 +298,7 @@ def _facts(report: "Report") -> Table:
         first = "-" if s["seconds_first"] is None else f"{s['seconds_first']:.1f} s"
         online = "-" if s["seconds_online_mean"] is None else f"{s['seconds_online_mean']:.2f} s"
         table.add_row("training", f"first frame {first}, each further one {online}, peak memory {memory}")
-        stages = s["peak_memory_bytes_by_stage"]
-        if stages:
+        if stages := s["peak_memory_bytes_by_stage"]:
             table.add_row("memory by stage", "; ".join(f"{name} {human_bytes(size)}" for name, size in stages.items()))
     table.add_row(
         "rendering",

@@ -10,19 +10,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 
 from structgstream.cli.app import StopSignal, UsageError, interruption, usage_errors
-from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, check_new, parse_options
-from structgstream.cli.progress import display, frames_text, human_bytes, print_lines
+from structgstream.cli.options import (
+    Device,
+    Flag,
+    Folder,
+    Number,
+    StreamFile,
+    StreamOutput,
+    check_ending,
+    check_new,
+    parse_options,
+    shown_as,
+)
+from structgstream.cli.progress import counting_bars, display, frames_text, human_bytes, print_lines
 
 if TYPE_CHECKING:
-    from structgstream.data.source import FrameSource
-    from structgstream.groups.base import GroupBase
     from structgstream.groups.seam_blend import Border
-    from structgstream.groups.track_pass import TrackOptions
-    from structgstream.groups.unit import SegmentTask
-    from structgstream.kernels.backend import Backend
 
 
 @dataclass(frozen=True)
@@ -45,18 +51,18 @@ class Track:
     without sound."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="TRACK")]
     """The track to write."""
-    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    groups: Number = None
     """Frames of a group. Default: as many as from one key packet to the next."""
     split_at_low_motion: Flag = False
     """Begin groups where few pixels change, half of N to one and a half times N frames apart."""
     allow_unaligned: Flag = False
     """Allow an N that is no multiple of the interval of key packets; each group then costs one more key packet."""
-    frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
+    frames: Annotated[int | None, shown_as("M")] = None
     """Number of frames. Default: all."""
-    after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
+    after: Annotated[Path | None, shown_as("SEGMENT")] = None
     """Begin at the end of this finished segment, with its fitted positions, which are more exact than tracked ones: for
     the groups after it."""
-    cameras: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    cameras: Number = None
     """Largest number of cameras for a frame; of more, every second or third is used, in turn. Default: half of the
     rig, from 6 to 14."""
     device: Device = "auto"
@@ -72,8 +78,8 @@ def track(arguments: list[str]) -> None:
     from structgstream.atomic_files import remove_unused
     from structgstream.groups.base import GroupBase, open_for
     from structgstream.groups.segment_file import open_segment
-    from structgstream.groups.track_file import check_length, groups_path
-    from structgstream.groups.track_pass import TrackOptions
+    from structgstream.groups.track_file import check_length, groups_path, open_track
+    from structgstream.groups.track_pass import TrackOptions, track_capture
     from structgstream.groups.tracking import TrackConfig
     from structgstream.kernels.backend import select_backend
 
@@ -91,25 +97,14 @@ def track(arguments: list[str]) -> None:
         remove_unused(options.output)
         remove_unused(groups_path(options.output))
     chosen = TrackOptions(length, options.split_at_low_motion, after, TrackConfig(cameras=options.cameras))
-    spent = _track(options.output, source, base, chosen, backend)
-    _say(options.output, len(source), spent)
-
-
-def _track(
-    path: Path, source: "FrameSource", base: "GroupBase", options: "TrackOptions", backend: "Backend"
-) -> float | None:
-    """Tracks what is missing; mean processor time of a frame in seconds, None if nothing was."""
-    from structgstream.groups.track_pass import track_capture
-
-    columns = [TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TimeElapsedColumn()]
-    done, last, spent = 0, len(source) - 1, list[float]()
+    path, done, last, spent = options.output, 0, len(source) - 1, list[float]()
     with (
         interruption(
             lambda: f"Frame {done} of {last} was tracked; give the same command to go on from the last start."
         ),
         StopSignal() as ending,
-        Progress(*columns, TimeRemainingColumn(), console=Console()) as bars,
-        closing(track_capture(path, source, base, options, backend)) as frames,
+        counting_bars("tracking", TimeElapsedColumn(), TimeRemainingColumn(), console=Console()) as bars,
+        closing(track_capture(path, source, base, chosen, backend)) as frames,
     ):
         task = bars.add_task("tracking", total=last)
         for progress in frames:
@@ -117,20 +112,11 @@ def _track(
             spent.append(progress.cpu_seconds)
             bars.update(task, completed=done)
             ending.end(whole=done == last)
-    return sum(spent) / len(spent) if spent else None
-
-
-def _say(path: Path, frames: int, spent: float | None) -> None:
-    from structgstream.groups.track_file import open_track
-
-    groups = open_track(path).groups or []
-    size = human_bytes(path.stat().st_size)
+    groups, size = open_track(path).groups or [], human_bytes(path.stat().st_size)
+    listed = " ".join(f"{first}:{end}" for first, end in groups[:8]) + (" ..." if len(groups) > 8 else "")
+    took = f"; {sum(spent) / len(spent):.2f} core-seconds a frame" if spent else ""
     print_lines(
-        Console(),
-        f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
-        + " ".join(f"{first}:{end}" for first, end in groups[:8])
-        + (" ..." if len(groups) > 8 else "")
-        + ("" if spent is None else f"; {spent:.2f} core-seconds a frame"),
+        Console(), f"Wrote {path}: {len(source)} frames, {size}; {len(groups)} groups in {path}.groups: {listed}{took}"
     )
 
 
@@ -152,9 +138,9 @@ class FitGroup:
     """The group: frames A to B - 1, counted from the header's first."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SEGMENT")]
     """The segment to write."""
-    track: Annotated[Path | None, tyro.conf.arg(metavar="TRACK", help_behavior_hint="")] = None
+    track: Annotated[Path | None, shown_as("TRACK")] = None
     """The track of the capture; may be left out for A = 0 only."""
-    iterations: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    iterations: Number = None
     """Optimisation steps of the group's first frame. Default: eleven times those of an online frame."""
     rounds: int = 3
     """Rounds of scene flow, spawning and iterations of the group's first frame."""
@@ -168,29 +154,20 @@ def fit_group(arguments: list[str]) -> None:
     """Fits with a progress display."""
     options = parse_options(FitGroup, "fit-group", arguments=arguments)
     check_ending(options.output, ".sgs", command="fit-group")
-    matched = re.fullmatch(r"(\d+):(\d+)", options.frames)
-    if matched is None:
+    if re.fullmatch(r"\d+:\d+", options.frames) is None:
         raise UsageError(f"--frames {options.frames}: a group is A:B, such as --frames 60:120.")
     if (options.iterations is not None and options.iterations < 1) or options.rounds < 1:
         raise UsageError("--iterations and --rounds must be at least 1.")
-    first, end = int(matched[1]), int(matched[2])
+    first, end = map(int, options.frames.split(":"))
     if first >= end:
         raise UsageError(f"--frames {options.frames} is empty; B is the frame after the last one.")
     from structgstream.groups.first_frame import GroupStartConfig
-    from structgstream.groups.unit import SegmentTask
+    from structgstream.groups.unit import SegmentTask, fit_segment
+    from structgstream.kernels.backend import select_backend
 
     logging.basicConfig(format="structgstream: %(message)s")  # warnings between progress lines
     start = GroupStartConfig(iterations=options.iterations, rounds=options.rounds)
     task = SegmentTask(options.scene, options.init, options.track, first, end, start)
-    written = _fit(options, task)
-    print_lines(Console(), f"Wrote {options.output}" if written else f"{options.output} is finished.")
-
-
-def _fit(options: FitGroup, task: "SegmentTask") -> bool:
-    """Fits what is missing of the segment; whether anything was."""
-    from structgstream.groups.unit import fit_segment
-    from structgstream.kernels.backend import select_backend
-
     run = fit_segment(
         options.output,
         task,
@@ -199,19 +176,20 @@ def _fit(options: FitGroup, task: "SegmentTask") -> bool:
         on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
     )
     if run is None:
-        return False
-    done, frames = run.done, task.end - task.first
+        print_lines(Console(), f"{options.output} is finished.")
+        return
+    done = run.done
     with (
-        interruption(lambda: f"{done - task.first} of {frames} frames are safe; give the same command to go on."),
+        interruption(lambda: f"{done - first} of {end - first} frames are safe; give the same command to go on."),
         StopSignal() as ending,
-        display(task.end, done=done) as progress,
+        display(end, done=done) as progress,
         closing(run.reports) as reports,
     ):
         for report in reports:
             progress.frame(report)
             done = report.index + 1
-            ending.end(whole=done == task.end)
-    return True
+            ending.end(whole=done == end)
+    print_lines(Console(), f"Wrote {options.output}")
 
 
 @dataclass(frozen=True)
@@ -224,11 +202,9 @@ class Join:
     Example: structgstream join groups/*.sgs -o ball.sgs
     """
 
-    segments: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEGMENT [SEGMENT ...]", help_behavior_hint="")
-    ]
+    segments: Annotated[tyro.conf.Positional[tuple[Path, ...]], shown_as("SEGMENT [SEGMENT ...]")]
     """Segments that fit-group has written, in any order."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write."""
     check: Flag = False
     """Decode every frame of the result, too."""
@@ -236,7 +212,7 @@ class Join:
     """Copy the packets of every group as they are, without blending."""
     device: Device = "auto"
     """Compute back-end of the blending."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    workers: Number = None
     """Processes of one thread each that blend borders. Default: one a core; one on a GPU."""
     overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
@@ -250,34 +226,23 @@ def join(arguments: list[str]) -> None:
     if not options.segments:
         raise UsageError("join needs the segments of a stream.")
     check_new(output, overwrite=options.overwrite)
+    from structgstream.evaluation.environment import usable_cores
     from structgstream.groups.join import join_segments
     from structgstream.kernels.backend import select_backend
 
     backend = None if options.plain or len(options.segments) < 2 else select_backend(options.device)
-    console = Console()
+    usual = 1 if backend is None or backend.name == "cuda" else usable_cores()
+    workers, console = usual if options.workers is None else options.workers, Console()
+
+    def report(border: "Border") -> None:
+        print_lines(
+            console,
+            f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "
+            f"{border.withdrawn:,} do not, as two fits side by side would show there.",
+        )
+
     frames = join_segments(
-        options.segments,
-        output,
-        check=options.check,
-        backend=backend,
-        workers=_workers(options.workers, backend),
-        on_border=lambda border: _print_border(border, console),
+        options.segments, output, check=options.check, backend=backend, workers=workers, on_border=report
     )
     size = human_bytes(output.stat().st_size)
     print_lines(console, f"Wrote {output}: {frames_text(frames)} of {len(options.segments)} groups, {size}")
-
-
-def _workers(asked: int | None, backend: "Backend | None") -> int:
-    from structgstream.evaluation.environment import usable_cores
-
-    if asked is not None or backend is None:
-        return 1 if asked is None else asked
-    return 1 if backend.name == "cuda" else usable_cores()
-
-
-def _print_border(border: "Border", console: Console) -> None:
-    print_lines(
-        console,
-        f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "
-        f"{border.withdrawn:,} do not, as two fits side by side would show there.",
-    )

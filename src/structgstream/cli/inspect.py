@@ -15,7 +15,15 @@ import tyro
 from rich.table import Table
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Flag, JsonPath, StreamFile, check_ending, parse_options, write_json_output
+from structgstream.cli.options import (
+    Flag,
+    JsonPath,
+    StreamFile,
+    check_ending,
+    parse_options,
+    shown_as,
+    write_json_output,
+)
 from structgstream.cli.progress import (
     SHOWN_FRAMES,
     change,
@@ -56,7 +64,7 @@ class Inspect:
 
     stream: tyro.conf.Positional[StreamFile]
     """The stream file, or the folder of a capture."""
-    plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH.png", help_behavior_hint="")] = None
+    plot: Annotated[Path | None, shown_as("PATH.png")] = None
     """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
     """Write everything to this file, with the keys "header" and "packets"; - is standard
@@ -78,7 +86,7 @@ def main(arguments: list[str]) -> None:
         _print_capture(options)
         return
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.byte_count import packet_rows
+    from structgstream.evaluation.byte_count import packet_rows, parts_of, write_byte_plot
     from structgstream.evaluation.run_log import log_of
 
     with open_stream(options.stream) as reader:
@@ -87,21 +95,23 @@ def main(arguments: list[str]) -> None:
         content = describe_stream(reader, rows, log=log)
         console = write_json_output(options.json, content)
         if plot is not None:
-            draw_byte_plot(plot, reader, rows, name=options.stream.name)
+            if not rows:
+                raise UsageError("the stream has no whole frame, so there is nothing to draw.")
+            title = f"{options.stream.name}: {frames_text(len(rows))}, {bit_rate_text(rows, reader.header.fps)}"
+            write_byte_plot(plot, rows, parts_of(reader, rows), title=title)
     if options.config:
         console.print_json(json.dumps(content["header"]["config"]))
         return
-    packets = packet_table(rows, every=options.all_packets)
+    periods = content["header"]["periods"]
     for part in (
         facts_table(content["header"], rows, packets=content["packets"]),
-        period_table(content["header"]["periods"]),
-        *(header_table(period) for period in content["header"]["periods"][:MAX_PERIODS]),
-        packets,
+        period_table(periods),
+        *map(header_table, periods[:MAX_PERIODS]),
+        packet_table(rows, every=options.all_packets),
     ):
-        if part is None:
-            continue
-        console.print(part)
-        console.print()
+        if part is not None:
+            console.print(part)
+            console.print()
     if plot is not None:
         print_lines(console, f"Wrote {plot}")
 
@@ -113,16 +123,6 @@ def _print_capture(options: Inspect) -> None:
     console = write_json_output(options.json, content)
     for table in capture_tables(options.stream.resolve().name, content):
         console.print(table)
-
-
-def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
-    """Writes the picture."""
-    if not rows:
-        raise UsageError("the stream has no whole frame, so there is nothing to draw.")
-    from structgstream.evaluation.byte_count import parts_of, write_byte_plot
-
-    title = f"{name}: {frames_text(len(rows))}, {bit_rate_text(rows, reader.header.fps)}"
-    write_byte_plot(path, rows, parts_of(reader, rows), title=title)
 
 
 def describe_stream(
@@ -264,13 +264,13 @@ def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:
     titles = ("period", "frame", "frames", "seconds", "anchors", "header", "packets", "begins")
     table = compact_table(*titles, left=("begins",), title="periods")
     for one in periods:
-        anchors = one["fields"]["anchor_positions"]["shape"][0] if "anchor_positions" in one["fields"] else ""
+        positions = one["fields"].get("anchor_positions")
         table.add_row(
             str(one["period"]),
             str(one["first_frame"]),
             str(one["frames"]),
             f"{one['seconds']:.2f}",
-            f"{anchors:,}" if anchors != "" else "-",
+            f"{positions['shape'][0]:,}" if positions else "-",
             human_bytes(one["header_bytes"]),
             human_bytes(one["packet_bytes"]),
             *literal_cells(one["begins"] or "-"),
@@ -282,12 +282,10 @@ def header_table(header: Mapping[str, Any]) -> Table:
     """The fields of an init record, largest first."""
     title = f"header of period {header['period']}" if header["period"] else "header"
     table = compact_table("field", "shape", "bytes", "share", "bits a value", left=("field",), title=title)
-    whole = header["header_bytes"]
-    rest = whole
+    rest = whole = header["header_bytes"]
     for name, field in sorted(header["fields"].items(), key=lambda item: -item[1]["bytes"]):
         size, values = field["bytes"], math.prod(field["shape"])
-        shape = " x ".join(f"{length}" for length in field["shape"])
-        bits = f"{8 * size / values:.2f}" if values else "-"
+        shape, bits = " x ".join(map(str, field["shape"])), f"{8 * size / values:.2f}" if values else "-"
         table.add_row(name.replace("_", " "), shape, f"{size:,}", f"{size / whole:.1%}", bits)
         rest -= size
     table.add_row("the rest", "", f"{rest:,}", f"{rest / whole:.1%}", "")
@@ -360,15 +358,9 @@ def _describe_footage(path: Path, remarks: list[str]) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
     for name in footage.cameras:
         stamps, track = footage.stamps(name), footage.tracks.get(name)
-        colors, turned = ("-", "no") if track is None else (track.colors, _turned(track))
-        cameras[name] = {
-            "size": footage.size(name),
-            "lens": "-",
-            "frames": len(stamps),
-            "colors": colors,
-            "turned": turned,
-        }
+        cameras[name] = {"size": footage.size(name), "lens": "-", "frames": len(stamps)}
         cameras[name] |= {"first_seconds": float(stamps[0]), "last_seconds": float(stamps[-1])}
+        cameras[name] |= {"colors": "-", "turned": "no"} if track is None else _of_track(track)
     remark = f"There is no calibration: structgstream prepare {path} -o CAPTURE makes a capture of these files."
     return {
         "layout": "videos or pictures without calibration",
@@ -423,20 +415,19 @@ def _camera(source: "FrameSource", name: str) -> dict[str, Any]:
     if isinstance(stored, VideoSource):
         track, stamps = stored.tracks[name], [stamp for stamp in stored.stamps[name] if stamp is not None]
         times = [(stamp - track.origin) * track.tick_seconds for stamp in (stamps[0], stamps[-1])]
-        found |= {"frames": len(stamps), "first_seconds": times[0], "last_seconds": times[1], "colors": track.colors}
-        found["turned"] = _turned(track)
+        found |= {"frames": len(stamps), "first_seconds": times[0], "last_seconds": times[1], **_of_track(track)}
     elif isinstance(stored, ImageSource):
         places = [place for place, file in enumerate(stored.files[name]) if file is not None]
-        found |= {"frames": len(places)}
-        found |= {"first_seconds": places[0] / stored.fps, "last_seconds": places[-1] / stored.fps}
+        first, last = places[0], places[-1]
+        found |= {"frames": len(places), "first_seconds": first / stored.fps, "last_seconds": last / stored.fps}
         found["colors"] = next(file.suffix for file in stored.files[name] if file is not None)
         turn = stored.turns.get(name, 1)
         found["turned"] = "no" if turn == 1 else f"EXIF {turn}"
     return found
 
 
-def _turned(track: "VideoTrack") -> str:
-    return f"{90 * track.quarter_turns} degrees" if track.quarter_turns else "no"
+def _of_track(track: "VideoTrack") -> dict[str, str]:
+    return {"colors": track.colors, "turned": f"{90 * track.quarter_turns} degrees" if track.quarter_turns else "no"}
 
 
 @contextmanager

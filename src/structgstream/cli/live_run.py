@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -18,8 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from structgstream.cli.app import StopSignal, UsageError, usage_errors
-from structgstream.cli.options import CaptureOptions, Flag
-from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
+from structgstream.cli.options import CaptureOptions, Flag, shown_as
+from structgstream.cli.progress import Bars, Lines, display, human_bytes, plain_table, summary
 
 if TYPE_CHECKING:
     from structgstream.data.denoising import DenoisingConfig
@@ -37,7 +36,7 @@ class LiveChoice:
     live: Flag = False
     """FOLDER is a rig file of cameras that send now; what they send while a frame is fitted is skipped. The stream ends
     after --frames, or with Ctrl-C."""
-    record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    record: Annotated[Path | None, shown_as("FOLDER")] = None
     """Live only: record all that the cameras send, as a capture that can be reconstructed with every frame."""
 
     def check(self, scene: Path) -> None:
@@ -87,10 +86,9 @@ def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str]
     from structgstream.data.source import frame_count
     from structgstream.recorder import RunMetrics
 
-    if isinstance(source, LiveSource):
-        live, captured = source.status, source.captured
-        return RunMetrics(stream, fps=source.fps, live=live, captured=captured, qualities=qualities)
-    return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
+    if not isinstance(source, LiveSource):
+        return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
+    return RunMetrics(stream, fps=source.fps, live=source.status, captured=source.captured, qualities=qualities)
 
 
 @contextmanager
@@ -204,7 +202,7 @@ def state_parts(values: Mapping[str, Any]) -> list[str]:
     parts = []
     if live is not None:
         present = sum(camera["present"] for camera in live["cameras"].values())
-        parts += [
+        parts = [
             f"{present}/{len(live['cameras'])} cameras",
             f"in {_number(values['frames_in_per_second'])}/s out {_number(values['frames_out_per_second'], 2)}/s",
             f"skipped {live['skipped_sets']:,}",
@@ -228,9 +226,8 @@ def stage_parts(values: Mapping[str, Any]) -> list[str]:
 
 def qualities_table(qualities: Mapping[str, Mapping[str, Any]]) -> Table:
     """A row a quality: its frames, its rate and bytes, decibels on training views, and seconds a frame."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("quality", "frames", "kbit/s", "bytes", "train dB", "s a frame"):
-        table.add_column(title, justify="left" if title == "quality" else "right")
+    numbers = ("frames", "kbit/s", "bytes", "train dB", "s a frame")
+    table = plain_table("quality", *numbers, right=numbers)
     for name, own in qualities.items():
         bits = own["bits_per_second"]
         table.add_row(
@@ -246,9 +243,7 @@ def qualities_table(qualities: Mapping[str, Mapping[str, Any]]) -> Table:
 
 def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
     """A row a camera: whether it sends, its pictures, and what went wrong how often."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("camera", "", "pictures", "queue", "faults"):
-        table.add_column(title, justify="right" if title in ("pictures", "queue") else "left")
+    table = plain_table("camera", "", "pictures", "queue", "faults", right=("pictures", "queue"))
     for name, camera in cameras.items():
         faults = Flow(f"{kind} {count:,}" for kind, count in camera["faults"].items())
         state = Text("sends", style="green") if camera["present"] else Text("absent", style="red")
@@ -261,6 +256,5 @@ def _number(value: float | None, digits: int = 1) -> str:
 
 
 def _duration(seconds: float) -> str:
-    return time.strftime("%H:%M:%S", time.gmtime(seconds % 86400)) + (
-        f" + {int(seconds // 86400)} d" if seconds >= 86400 else ""
-    )
+    days = f" + {int(seconds // 86400)} d" if seconds >= 86400 else ""
+    return time.strftime("%H:%M:%S", time.gmtime(seconds % 86400)) + days

@@ -19,18 +19,28 @@ from structgstream.cli.app import UsageError, usage_errors
 from structgstream.exporters.formats import SUFFIXES
 
 if TYPE_CHECKING:
-    from structgstream.codec.segments.sink import Clocks
+    from structgstream.codec.segments.sink import Clocks, SegmentsOptions
     from structgstream.data.source import FrameSource
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
     from structgstream.session.presets import StreamConfig
 
+
+def shown_as(metavar: str | None = None, *aliases: str) -> Any:
+    """How help shows an option whose text states its default."""
+    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint="")
+
+
 Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
 Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
 StreamFile = Annotated[Path, tyro.conf.arg(metavar="STREAM")]
-Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
-JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH|-", help_behavior_hint="")]
+StreamOutput = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+Cameras = Annotated[tuple[str, ...] | None, shown_as("CAMERA [CAMERA ...]")]
+Number = Annotated[int | None, shown_as("N")]
+PresetName = Annotated[str | None, shown_as("NAME")]
+Flag = Annotated[bool, shown_as()]
+JsonPath = Annotated[Path | None, shown_as("PATH|-")]
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 
 
@@ -38,20 +48,18 @@ STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.Disa
 class CaptureOptions:
     """Options that select the part of a capture, and its picture size."""
 
-    held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
-        None
-    )
+    held_out: Cameras = None
     """Cameras to keep from training; auto: the one best surrounded by others. Default: those that the capture's
     layout holds out."""
     scale: float = 1.0
     """Size of the pictures relative to the stored ones, in (0, 1]."""
     start: int = 0
     """First frame to use."""
-    frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    frames: Number = None
     """Number of frames. Default: all."""
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Use every N-th frame, from the first; the frames a second are divided by N."""
-    near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
+    near: Annotated[float | None, shown_as()] = None
     """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 times the
     largest distance of a training camera to their centre."""
     roving: Literal["auto", "none"] = "auto"
@@ -168,16 +176,7 @@ def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource"
     """The part of a capture that the options select."""
     from structgstream.data.open import open_capture
 
-    return open_capture(
-        scene,
-        held_out=options.held_out,
-        scale=options.scale,
-        start=options.start,
-        frames=options.frames,
-        near=options.near,
-        every=options.every,
-        roving=options.roving == "auto",
-    )
+    return open_capture(scene, **{**vars(options), "roving": options.roving == "auto"})
 
 
 COLUMN = 52
@@ -235,14 +234,14 @@ Sink = Literal["file", "segments"]
 class SegmentOptions:
     """Options of --sink segments (docs/segments.md)."""
 
-    sink: Annotated[Sink | None, tyro.conf.arg(help_behavior_hint="")] = None
+    sink: Annotated[Sink | None, shown_as()] = None
     """file: OUT is one file. segments: OUT is a folder of immutable files and a manifest, which any web host can serve
     while it grows. Default: segments if OUT is a folder with a manifest.json, else file."""
-    window: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    window: Annotated[float | None, shown_as("SECONDS")] = None
     """Segments only: how far viewers can go back; older segments are removed. Default: nothing is removed."""
     keep: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 120.0
     """Segments only: how long a file stays that the manifest no longer names; viewers may be about to fetch it."""
-    publish: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    publish: Annotated[str | None, shown_as("URL")] = None
     """Segments only: copy OUT to this folder of an object store as it grows, such as s3://bucket/studio. When it cannot
     be reached, the stream continues in OUT, and is copied later. Needs the extra cloud."""
 
@@ -256,16 +255,18 @@ class SegmentOptions:
                 f"{output} holds several qualities of one stream; continue them with --qualities, or choose another "
                 "name."
             )
-        found: Sink = "segments" if (output / MANIFEST).is_file() else "file"
-        sink = self.sink or found
+        sink: Sink = self.sink or ("segments" if (output / MANIFEST).is_file() else "file")
         if sink == "file" and (self.window is not None or self.publish is not None):
             raise UsageError(f"{'--publish' if self.window is None else '--window'} is for --sink segments.")
-        self._check_seconds()
+        self._checked()
         return sink
 
-    def _check_seconds(self) -> None:
+    def _checked(self) -> "SegmentsOptions":
+        from structgstream.codec.segments.sink import SegmentsOptions
+
         if not (self.window is None or 0 < self.window < math.inf) or not self.keep >= 0:
             raise UsageError("--window must be a positive number of seconds, and --keep zero or more.")
+        return SegmentsOptions(self.window, self.keep)
 
     def quality_folders(
         self, output: Path, names: Sequence[str], *, resume: bool, overwrite: bool, clocks: "Clocks | None" = None
@@ -273,7 +274,6 @@ class SegmentOptions:
         """Where each quality of a stream goes, a folder in ``output``, checked before anything takes time."""
         from structgstream.codec.segments.manifest import MANIFEST
         from structgstream.codec.segments.quality_list import read_list
-        from structgstream.codec.segments.sink import SegmentsOptions
         from structgstream.recorder import segments_at, segments_folder
 
         listed = read_list(output)
@@ -287,17 +287,16 @@ class SegmentOptions:
                 "--publish copies one stream, and --qualities writes several; copy the folder with another program, or "
                 "run without it."
             )
-        self._check_seconds()
+        options = self._checked()
         if (output / MANIFEST).is_file():
             raise UsageError(f"{output} holds one stream, and --qualities writes several; choose another name.")
-        there = [] if listed is None else [quality.name for quality in listed]
+        there = [quality.name for quality in listed or ()]
         if listed is not None and (resume or overwrite) and sorted(there) != sorted(names):
             raise UsageError(
                 f"{output} holds the qualities {', '.join(there)}, got {', '.join(names)}; give the same names, or "
                 "choose another OUT."
             )
         stores = {name: segments_folder(output / name, may_exist=resume or overwrite) for name in names}
-        options = SegmentsOptions(self.window, self.keep)
         return {name: segments_at(store, options=options, clocks=clocks) for name, store in stores.items()}
 
     @contextmanager
@@ -308,10 +307,9 @@ class SegmentOptions:
 
         The end of the block waits until everything is published; ``report`` gets a sentence if that fails.
         """
-        from structgstream.codec.segments.sink import SegmentsOptions
         from structgstream.recorder import check_output, segments_at, segments_folder
 
-        options = SegmentsOptions(self.window, self.keep)
+        options = self._checked()
         if self.chosen(output) == "file":
             check_output(output, may_exist=may_exist)
             yield None

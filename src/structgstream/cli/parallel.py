@@ -21,11 +21,15 @@ from structgstream.cli.options import (
     Flag,
     Folder,
     JsonPath,
+    Number,
+    PresetName,
+    StreamOutput,
     as_arguments,
     check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
+    shown_as,
     write_json_output,
 )
 from structgstream.cli.progress import compact_table, human_bytes, literal_cells, print_lines
@@ -47,14 +51,14 @@ class WorkerOptions:
 
     executor: ExecutorName = "local"
     """local: processes of this machine; ray: a Ray cluster, which needs the extra cluster (docs/cluster.md)."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    workers: Number = None
     """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
-    threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    threads: Number = None
     """Threads of each. Default: its share of the cores; one on a cluster."""
-    track_threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    track_threads: Number = None
     """Threads of the tracking pass, for which all groups wait; fewer groups run meanwhile if these are more than a
     worker's. Default: as a worker."""
-    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    address: Annotated[str | None, shown_as("HOST:PORT")] = None
     """Head of the Ray cluster to join. Default: a cluster of this machine alone, for this run."""
 
     @property
@@ -80,25 +84,25 @@ class Parallel:
 
     scene: tyro.conf.Positional[Folder]
     """The capture; on a cluster all machines see it at the same place."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write; on a cluster all machines see its folder at the same place."""
-    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    groups: Number = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
     split_at_low_motion: Flag = False
     """Move each border between groups to a frame nearby in which few pixels change."""
     allow_unaligned: Flag = False
     """Allow an N that is no multiple of the key interval; each group then costs one more key packet."""
-    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    preset: PresetName = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
-    quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
+    quality: Annotated[float | None, shown_as("Q")] = None
     """0 is the preset's quality, 1 halves every quantization step, -1 doubles it; from -6 to 6."""
     device: Device = "auto"
     """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    seed: Number = None
     """Random seed. Default: the preset's."""
     overwrite: Flag = False
     """Replace OUT and its parts when they exist."""
-    store: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    store: Annotated[str | None, shown_as("URL")] = None
     """Object store of the parts if machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     run: WorkerOptions = field(default_factory=WorkerOptions)
@@ -205,18 +209,19 @@ def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
     return (*backend, "--workers", str(min(cores, sum(slot.threads for slot in slots))))
 
 
+CAPTURE_PART = ("start", "near", "every", "scale", "held_out", "roving")
+"""Options of a capture that reconstruct and parallel are given, besides its length."""
+
+
 def _job(options: Parallel, rest: list[str]) -> "Job":
     from structgstream.parallel.driver import Job, Unit
 
-    capture = options.capture
-    header = as_arguments(options, "preset", "quality", "seed")
-    header += as_arguments(capture, "start", "near", "every", "scale", "held_out", "roving")
-    track = as_arguments(options, "groups", "split_at_low_motion", "allow_unaligned")
+    header = as_arguments(options, "preset", "quality", "seed") + as_arguments(options.capture, *CAPTURE_PART)
     unit = Unit(
         str(options.scene.absolute()),
-        capture.frames,
+        options.capture.frames,
         (*header, *rest),
-        tuple(track),
+        tuple(as_arguments(options, "groups", "split_at_low_motion", "allow_unaligned")),
         options.run.track_threads,
         ("--device", options.device),
         join_arguments(options.run, options.device),
@@ -252,12 +257,10 @@ def cells(states: Sequence["State"], *, width: int) -> Text:
     """A sign per group; of many groups, one for several, which shows the least advanced state."""
     share = max(1, -(-len(states) // (width * ROWS)))
     text = Text()
-    for start in range(0, len(states), share):
+    for place, start in enumerate(range(0, len(states), share), 1):
         several = states[start : start + share]
-        state = next(name for name in WORST_FIRST if name in several)
-        sign, style = STYLES[state]
-        text.append(sign, style)
-        if (start // share + 1) % width == 0:
+        text.append(*STYLES[next(name for name in WORST_FIRST if name in several)])
+        if place % width == 0:
             text.append("\n")
     return text
 
@@ -342,21 +345,21 @@ class Plan:
 
     scene: tyro.conf.Positional[Folder]
     """The capture."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint="")] = None
+    output: Annotated[Path | None, shown_as("FOLDER", "-o")] = None
     """Folder of the probe."""
-    run: Annotated[Path | None, tyro.conf.arg(metavar="OUT.parts", help_behavior_hint="")] = None
+    run: Annotated[Path | None, shown_as("OUT.parts")] = None
     """Parts of a finished run to take the measurements from; no probe is made."""
-    machines: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N ...]", help_behavior_hint="")] = (1, 8, 64)
+    machines: Annotated[tuple[int, ...], shown_as("N [N ...]")] = (1, 8, 64)
     """Numbers of machines to plan for, each like this one."""
     workers: int = 1
     """Workers that run side by side on each machine; each is taken to be as fast as the measured one alone."""
-    finish_hours: Annotated[float | None, tyro.conf.arg(metavar="H", help_behavior_hint="")] = None
+    finish_hours: Annotated[float | None, shown_as("H")] = None
     """Say how many workers end within H hours."""
-    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    groups: Number = None
     """Frames of a group. Default: one key interval."""
-    length: Annotated[int | None, tyro.conf.arg(metavar="FRAMES", help_behavior_hint="")] = None
+    length: Annotated[int | None, shown_as("FRAMES")] = None
     """Plan for so many frames instead of the capture's."""
-    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    preset: PresetName = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
     device: Device = "auto"
     """Compute back-end of the probe."""
@@ -395,8 +398,7 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     stream = options.output / "probe.sgs"
     probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
     probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1"]
-    probe += as_arguments(options, "device", "preset")
-    probe += as_arguments(options.capture, "held_out", "scale", "start", "every", "near", "roving")
+    probe += as_arguments(options, "device", "preset") + as_arguments(options.capture, *CAPTURE_PART)
     console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
     if status := command([*probe, *rest]):
         raise SystemExit(status)  # It has said why.
@@ -420,13 +422,12 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
     )
     _table(console, estimates)
     print_lines(console, _serial(costs.header_seconds, serial, alone, work.frames))
-    wanted = None
+    wanted, rate = None, 1 / costs.frame_seconds
     if options.finish_hours is not None:
         wanted = workers_for(costs, work, options.finish_hours * 3600)
         least = _time(estimate(costs, work, len(work.groups) + 1).seconds)
         ends = f"{wanted.workers} workers ({_time(wanted.seconds)})" if wanted else f"not possible; least {least}"
         print_lines(console, f"Within {options.finish_hours:g} h: {ends}.")
-    rate = 1 / costs.frame_seconds
     print_lines(console, _live(rate, source.fps), ASSUMED)
     if options.json is not None:
         facts: dict[str, Any] = {"work": asdict(work), "measured": asdict(found), "bytes": size, "live_fps": rate}

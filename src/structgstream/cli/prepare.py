@@ -10,14 +10,12 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError, interruptible, interruption, usage_errors
-from structgstream.cli.options import Flag, Folder, check_ending, parse_options
+from structgstream.cli.options import Flag, Folder, check_ending, parse_options, shown_as
 from structgstream.cli.progress import StepDisplay, print_lines
 
 if TYPE_CHECKING:
     from structgstream.pose_check.check import Finding
     from structgstream.preparation.options import PrepareOptions
-
-HIDDEN = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
@@ -41,53 +39,47 @@ class Prepare:
 
     videos: tyro.conf.Positional[Folder]
     """The folder of the cameras' videos or pictures; with --check, the capture."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CAPTURE", help_behavior_hint="")] = None
+    output: Annotated[Path | None, shown_as("CAPTURE", "-o")] = None
     """The folder to make."""
     check: Flag = False
     """Only check a capture."""
-    calibration: Annotated[str, tyro.conf.arg(metavar="auto|sfm|board|PATH", help_behavior_hint="")] = "auto"
+    calibration: Annotated[str, shown_as("auto|sfm|board|PATH")] = "auto"
     """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file in
     FOLDER, else sfm."""
-    lens: Annotated[
-        Literal["pinhole", "radial", "opencv", "brown", "fisheye"] | None, tyro.conf.arg(help_behavior_hint="")
-    ] = None
+    lens: Annotated[Literal["pinhole", "radial", "opencv", "brown", "fisheye"] | None, shown_as()] = None
     """Distortion to estimate; brown for phones. Default: radial by sfm, opencv by board."""
     intrinsics: Literal["own", "shared"] = "own"
     """Whether cameras share focal length and lens (sfm)."""
     refine: Flag = False
     """Adjust the calibration to the pictures, if matches that were set aside then fit better."""
-    board: Annotated[str | None, tyro.conf.arg(metavar="BOARD", help_behavior_hint="")] = None
+    board: Annotated[str | None, shown_as("BOARD")] = None
     """The board, as structgstream board named it: COLUMNSxROWS:SQUARE, such as 7x5:50mm. Default: 7x5:50mm."""
-    board_videos: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    board_videos: Annotated[Path | None, shown_as("FOLDER")] = None
     """Videos in which the board is shown to the cameras. Default: those of FOLDER."""
-    distance: Annotated[tuple[str, str, str] | None, tyro.conf.arg(metavar="A B LENGTH", help_behavior_hint="")] = None
+    distance: Annotated[tuple[str, str, str] | None, shown_as("A B LENGTH")] = None
     """Measured distance between the lenses of two cameras, such as 3.2m: the capture then is in metres."""
-    synchronize: Annotated[
-        Literal["auto", "csv", "stamps", "audio", "motion", "none"], tyro.conf.arg(help_behavior_hint="")
-    ] = "auto"
+    synchronize: Annotated[Literal["auto", "csv", "stamps", "audio", "motion", "none"], shown_as()] = "auto"
     """How clocks are found: by timestamps.csv beside the videos, the files' own times, sound, motion, or not at all
     (one signal starts all cameras). Default: csv if it is there, else sound, else motion."""
-    field_of_view: Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")] = None
+    field_of_view: Annotated[float | None, shown_as("DEGREES")] = None
     """Across the undistorted pictures. Default: the largest without black borders, up to 110."""
-    size: Annotated[str | None, tyro.conf.arg(metavar="WxH", help_behavior_hint="")] = None
+    size: Annotated[str | None, shown_as("WxH")] = None
     """Size of the undistorted pictures. Default: the size of the videos."""
-    held_out: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="auto|none|CAMERA [CAMERA ...]", help_behavior_hint="")
-    ] = ("none",)
+    held_out: Annotated[tuple[str, ...], shown_as("auto|none|CAMERA [CAMERA ...]")] = ("none",)
     """Cameras that are not trained on, so that evaluate can score them; auto takes the one best surrounded by others.
     Default: none."""
-    near: Annotated[float | None, HIDDEN] = None
+    near: Annotated[float | None, shown_as()] = None
     """Distance of the near plane, in units of the capture. Default: half of the depth of the nearest points."""
-    fps: Annotated[float | None, HIDDEN] = None
+    fps: Annotated[float | None, shown_as()] = None
     """Frames a second of folders of pictures. Default: 30."""
-    without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
+    without: Annotated[tuple[str, ...], shown_as("CAMERA [CAMERA ...]")] = ()
     """Cameras to leave out."""
-    roving: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO", help_behavior_hint="")] = None
+    roving: Annotated[Path | None, shown_as("VIDEO")] = None
     """A video of the set by a camera that is carried through it: it connects cameras that see too little in common, and
     gives frame 0 more views of what stands still."""
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
-    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    report: Annotated[Path | None, shown_as("FOLDER")] = None
     """With --check: folder of the report, new or that of an earlier one. Default: FOLDER/report."""
 
 
@@ -116,8 +108,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
     ended = "Completed steps remain; continue with the same command."
     with interruption(lambda: ended), interruptible(), StepDisplay(console) as display:
         made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
-    print_lines(console, f"Capture: {made.path}")
-    print_lines(console, f"Report: {made.report}")
+    print_lines(console, f"Capture: {made.path}", f"Report: {made.report}")
     return made.findings
 
 
@@ -132,27 +123,24 @@ def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
     return checked.report.findings
 
 
+AS_THEY_ARE = (
+    "lens", "intrinsics", "refine", "board_videos", "synchronize", "field_of_view", "near", "fps", "without", "link",
+    "roving",
+)  # fmt: skip
+"""Options that are those of preparation."""
+
+
 def _chosen(options: Prepare) -> "PrepareOptions":
     from structgstream.preparation.calibration.board import Board
     from structgstream.preparation.options import METHODS, PrepareOptions, parse_board, parse_distance, parse_size
 
     return PrepareOptions(
         calibration=options.calibration if options.calibration in METHODS else Path(options.calibration).expanduser(),
-        lens=options.lens,
-        intrinsics=options.intrinsics,
-        refine=options.refine,
         board=Board() if options.board is None else parse_board(options.board),
-        board_videos=options.board_videos,
         distance=None if options.distance is None else parse_distance(*options.distance),
-        synchronize=options.synchronize,
-        field_of_view=options.field_of_view,
         size=None if options.size is None else parse_size(options.size),
         held_out=() if options.held_out == ("none",) else options.held_out,
-        near=options.near,
-        fps=options.fps,
-        without=options.without,
-        link=options.link,
-        roving=options.roving,
+        **{name: getattr(options, name) for name in AS_THEY_ARE},
     )
 
 
@@ -160,12 +148,10 @@ def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
     """Prints what is wrong; the worst is an error."""
     from structgstream.errors import CaptureError
 
-    errors = [finding for finding in findings if finding.severity == "error"]
-    for finding in findings:
-        if finding is not (errors[0] if errors else None):
-            print_lines(console, f"{finding.severity}: {finding.sentence}")
-    if errors:
-        raise CaptureError(errors[0].sentence)
+    worst = next((finding for finding in findings if finding.severity == "error"), None)
+    print_lines(console, *(f"{one.severity}: {one.sentence}" for one in findings if one is not worst))
+    if worst is not None:
+        raise CaptureError(worst.sentence)
     warned = any(finding.severity == "warning" for finding in findings)
     found = "no error; see the warnings" if warned else "nothing that would spoil a stream"
     print_lines(console, f"The check found {found}.")
@@ -206,10 +192,8 @@ def board(arguments: list[str]) -> None:
     with usage_errors():
         board = parse_board(f"{options.squares}:{options.square}:{options.dictionary}")
         write_board_pdf(options.output, board, options.paper)
-    console = Console()
-    written = (
-        f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler."
+    print_lines(
+        Console(),
+        f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler.",
+        f"Then: structgstream prepare VIDEOS -o CAPTURE --calibration board --board {board_text(board)}",
     )
-    print_lines(console, written)
-    use = f"Then: structgstream prepare VIDEOS -o CAPTURE --calibration board --board {board_text(board)}"
-    print_lines(console, use)

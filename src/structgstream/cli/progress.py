@@ -8,12 +8,13 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group
+from rich.console import Console, Group, OverflowMethod
 from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -59,6 +60,14 @@ def literal_cells(*cells: str) -> tuple[Text, ...]:
     return tuple(Text(printable(cell)) for cell in cells)
 
 
+def plain_table(*titles: str, right: Collection[str] = (), overflow: OverflowMethod = "ellipsis") -> Table:
+    """A table with columns of these titles, without lines."""
+    table = Table(box=None, pad_edge=False)
+    for name in titles:
+        table.add_column(name, justify="right" if name in right else "left", overflow=overflow)
+    return table
+
+
 def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | None = None) -> Table:
     """A table with columns of these titles, of which ten columns of numbers fit into 80 characters."""
     table = Table(
@@ -69,11 +78,18 @@ def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | 
     return table
 
 
+def counting_bars(
+    description: str, *more: ProgressColumn, console: Console, transient: bool = False, disable: bool = False
+) -> Progress:
+    """Bars of tasks that count, with a ``description`` before and columns of ``more`` behind."""
+    columns = (TextColumn(description), BarColumn(bar_width=32), MofNCompleteColumn(), *more)
+    return Progress(*columns, console=console, transient=transient, disable=disable)
+
+
 @contextmanager
 def frame_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
     """A bar of ``total`` frames on standard error while the block runs; call what it gives after each frame."""
-    columns = [TextColumn(title), BarColumn(bar_width=32), MofNCompleteColumn(), TimeRemainingColumn()]
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with counting_bars(title, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("frames", total=total)
         yield lambda: bar.advance(task)
 
@@ -109,18 +125,17 @@ def change(came: int, went: int) -> str:
     return f" (+{came:,} -{went:,})" if came or went else ""
 
 
+REMARKS = {
+    "held": "fewer than two pictures show anything: the scene is held",
+    "views left out": "{} views left out: only their pictures changed, or theirs did not",
+    "scene cuts": "the pictures changed everywhere: motion segmentation skipped",
+    "spawning refused": "no births: too many pixels are missing at once",
+}
+
+
 def remarks(counts: Mapping[str, int]) -> str:
     """Remarks on a frame's pictures: outlier views and refused births (``training/online/select.py``)."""
-    found = []
-    if counts.get("held"):
-        found.append("fewer than two pictures show anything: the scene is held")
-    if counts.get("views left out"):
-        found.append(f"{counts['views left out']} views left out: only their pictures changed, or theirs did not")
-    if counts.get("scene cuts"):
-        found.append("the pictures changed everywhere: motion segmentation skipped")
-    if counts.get("spawning refused"):
-        found.append("no births: too many pixels are missing at once")
-    return "".join(f"  [{remark}]" for remark in found)
+    return "".join(f"  [{text.format(counts[name])}]" for name, text in REMARKS.items() if counts.get(name))
 
 
 def absences(cameras: Sequence[str]) -> str:
@@ -180,14 +195,9 @@ class Bars:
 
     def __init__(self, frames: int | None, done: int, *, console: Console) -> None:
         self._frames = frames
-        self._progress = Progress(
-            TextColumn("{task.description:<10}"),
-            BarColumn(bar_width=32),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}", style="dim"),
-            console=console,
+        note = TextColumn("{task.fields[note]}", style="dim")
+        self._progress = counting_bars(
+            "{task.description:<10}", TimeElapsedColumn(), TimeRemainingColumn(), note, console=console
         )
         self._all = self._progress.add_task("frames", total=frames, completed=done, note="")
         self._one = self._progress.add_task(f"frame {done + 1}", total=None, note="preparing")
@@ -224,15 +234,9 @@ class StepDisplay(AbstractContextManager["StepDisplay"]):
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bar = Progress(
-            TextColumn("{task.description:<12}"),
-            BarColumn(bar_width=32),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[what]}", style="dim"),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
+        what, off = TextColumn("{task.fields[what]}", style="dim"), not console.is_terminal
+        self._bar = counting_bars(
+            "{task.description:<12}", TimeElapsedColumn(), what, console=console, transient=True, disable=off
         )
         self._task: TaskID | None = None
         self._step, self._skipped, self._began = "", False, 0.0

@@ -22,12 +22,16 @@ from structgstream.cli.options import (
     Device,
     Flag,
     Folder,
+    Number,
+    PresetName,
     SegmentOptions,
+    StreamOutput,
     check_ending,
     config_lines,
     open_selected_capture,
     parse_known_options,
     resolve_config,
+    shown_as,
 )
 from structgstream.cli.progress import human_bytes, print_lines
 
@@ -39,7 +43,6 @@ if TYPE_CHECKING:
     from structgstream.recorder import Run, RunMetrics, Storage
     from structgstream.scene.scene import Scene
     from structgstream.session.presets import StreamConfig
-    from structgstream.training.result import StepListener
 
 
 @dataclass(frozen=True)
@@ -67,30 +70,28 @@ class Reconstruct:
     scene: tyro.conf.Positional[Folder]
     """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them; with --live
     the rig file of cameras that send now (docs/live.md)."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    output: StreamOutput
     """The stream file to write; with --sink segments, a folder."""
-    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    preset: PresetName = None
     """compact (default: small packets), fine (compact with twice the iterations), fast (compact in minutes), rig (the
     paper on any rig), motion (as rig, trains only what moves), paper-n3dv, paper-meetroom, paper-immersive, tiny (for
     tests)."""
-    quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
+    quality: Annotated[float | None, shown_as("Q")] = None
     """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it; from -6 to
     6."""
-    mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
+    mbits: Annotated[float | None, shown_as("R")] = None
     """Compact streams only: target rate in Mbit/s over every second, without the header. Default: constant quality."""
-    qualities: Annotated[
-        tuple[str, ...] | None, tyro.conf.arg(metavar="NAME=Q NAME=Q [NAME=Q ...]", help_behavior_hint="")
-    ] = None
+    qualities: Annotated[tuple[str, ...] | None, shown_as("NAME=Q NAME=Q [NAME=Q ...]")] = None
     """Several qualities of the same frames, each a folder OUT/NAME of segments with --quality Q, and a list from which
     players choose (docs/live.md). With --sink segments."""
     device: Device = "auto"
     """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    seed: Number = None
     """Random seed. Default: the preset's."""
-    sound: Annotated[str | None, tyro.conf.arg(metavar="CAMERA|FILE|auto|none", help_behavior_hint="")] = None
+    sound: Annotated[str | None, shown_as("CAMERA|FILE|auto|none")] = None
     """Sound to store with the frames: that of a camera, in step by its clock; a file, in step by what cameras hear of
     it; auto for the best microphone. Default: the microphone that prepare chose, otherwise none. Live: a camera."""
-    sound_offset: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    sound_offset: Annotated[float | None, shown_as("SECONDS")] = None
     """When the file of --sound begins, in seconds after the first frame of the capture. Default: found by what cameras
     hear."""
     resume: Flag = False
@@ -111,10 +112,11 @@ def main(arguments: list[str]) -> None:
         return
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
     check_ending(options.output, ".sgs", command="reconstruct", folder=True)
-    if options.sound_offset is not None and options.sound is None:
-        raise UsageError("--sound-offset says when the file of --sound begins; give that, too.")
-    if options.sound_offset is not None and options.live.live:
-        raise UsageError("--sound-offset is for files; the sound of a live camera is in step by its clock.")
+    if options.sound_offset is not None:
+        if options.sound is None:
+            raise UsageError("--sound-offset says when the file of --sound begins; give that, too.")
+        if options.live.live:
+            raise UsageError("--sound-offset is for files; the sound of a live camera is in step by its clock.")
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)
@@ -199,14 +201,12 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         print_lines(console, f"{'Warning: ' if expected.poor else ''}{expected.sentence}")
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
-    blind = unrecognized_faults(len(source.rig.training)) if config.online.motion.enabled else None
-    if blind is not None:
+    if config.online.motion.enabled and (blind := unrecognized_faults(len(source.rig.training))) is not None:
         console.print(blind, highlight=False)
     part = part_metadata(start=options.capture.start, scale=options.capture.scale, every=options.capture.every)
-    metadata = {"preset": preset, **part}
     if sound is not None:
         print_lines(console, f"Sound: {sound.name}.")
-    return OpenedScene(source, clocks, backend, metadata, sound)
+    return OpenedScene(source, clocks, backend, {"preset": preset, **part}, sound)
 
 
 def run_reconstruction(
@@ -233,32 +233,31 @@ def run_reconstruction(
     from structgstream.recorder import record
     from structgstream.session.struct_gstream import stream_pipeline
 
-    def start(on_step: "StepListener") -> "Run":
-        return record(
-            output,
-            source,
-            stream_pipeline(config),
-            backend,
-            resume=resume,
-            storage=storage,
-            metadata=metadata,
-            on_step=on_step,
-            remarks=None if metrics is None else metrics.frame,
-            sound=sound,
-        )
-
+    start = partial(
+        record,
+        output,
+        source,
+        stream_pipeline(config),
+        backend,
+        resume=resume,
+        storage=storage,
+        metadata=metadata,
+        remarks=None if metrics is None else metrics.frame,
+        sound=sound,
+    )
     return _follow(start, source, output=output, metrics=metrics)
 
 
 def _follow(
-    start: "Callable[[StepListener], Run]",
+    start: "Callable[..., Run]",
     source: "FrameStream",
     *,
     output: Path,
     metrics: "RunMetrics | None",
     in_qualities: bool = False,
 ) -> dict[str, int]:
-    """Starts a run and shows it until it ends or is stopped; returns the peaks of :func:`run_reconstruction`.
+    """Starts a run, given ``on_step``, and shows it until it ends or is stopped; returns the peaks of
+    :func:`run_reconstruction`.
 
     Ctrl-C interrupts a recording at once; live cameras and several qualities end after the frame being fitted.
     """
@@ -266,7 +265,7 @@ def _follow(
     from structgstream.data.source import frame_count
 
     stop = source.stop if isinstance(source, LiveSource) else lambda: None
-    run = start(lambda step: progress.step(step))  # progress needs the number of existing frames
+    run = start(on_step=lambda step: progress.step(step))  # progress needs the number of existing frames
     done = run.done
     total, peaks, pressed = frame_count(source), dict[str, int](), StopSignal(number=signal.SIGINT)
 
@@ -332,20 +331,18 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
     )
     metrics = run_metrics(opened.source, options.output, qualities=names)
 
-    def start(on_step: "StepListener") -> "Run":
-        return record_qualities(
-            options.output,
-            opened.source,
-            config,
-            qualities,
-            opened.backend,
-            storages=storages,
-            resume=options.resume,
-            metadata=opened.metadata,
-            on_step=on_step,
-            metrics=metrics,
-            sound=opened.sound,
-        )
-
+    start = partial(
+        record_qualities,
+        options.output,
+        opened.source,
+        config,
+        qualities,
+        opened.backend,
+        storages=storages,
+        resume=options.resume,
+        metadata=opened.metadata,
+        metrics=metrics,
+        sound=opened.sound,
+    )
     _follow(start, opened.source, output=options.output, metrics=metrics, in_qualities=True)
     print_lines(console, f"Wrote {options.output}: {', '.join(names)}")

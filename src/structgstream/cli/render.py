@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, islice, repeat
+from itertools import count, islice, repeat, starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +12,7 @@ from rich.console import Console
 
 from structgstream.atomic_files import side_path
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
+from structgstream.cli.options import Device, Flag, Number, StreamFile, check_ending, parse_options, shown_as
 from structgstream.cli.progress import print_lines
 
 if TYPE_CHECKING:
@@ -42,19 +42,19 @@ class Render:
 
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
-    scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FOLDER]", help_behavior_hint="")] = None
+    scene: Annotated[tyro.conf.Positional[Path | None], shown_as("[FOLDER]")] = None
     """The capture, for --compare."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
+    output: Annotated[Path | None, shown_as("OUT", "-o")] = None
     """Output file or folder. Default: a video next to the stream, named after the camera or the path."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")] = None
+    camera: Annotated[str | None, shown_as("CAMERA")] = None
     """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
-    path: Annotated[Literal["orbit", "arc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    path: Annotated[Literal["orbit", "arc"] | None, shown_as()] = None
     """Camera path: an orbit around one camera, or an arc from one camera to another."""
-    between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA", help_behavior_hint="")] = None
+    between: Annotated[tuple[str, str] | None, shown_as("CAMERA CAMERA")] = None
     """Ends of the arc. Default: two cameras well apart on the same side."""
-    seconds: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
+    seconds: Annotated[float | None, shown_as()] = None
     """Duration of the path. Default: the stream's, at least 4 s; a shorter stream is played slowed, back and forth."""
-    frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    frame: Number = None
     """Render only this frame; a path then shows a fixed time. Default: all frames."""
     compare: Flag = False
     """Truth, rendering and difference side by side."""
@@ -82,7 +82,8 @@ def main(arguments: list[str]) -> None:
     output = options.output or default_output(options, reader)
     with usage_errors():
         choose_frames(reader.runs, output, frame=options.frame, frames=None)
-    if output.suffix.lower() == ".png" and options.frame is None:
+    ending = output.suffix.lower()
+    if ending == ".png" and options.frame is None:
         raise UsageError("a PNG holds one picture: choose it with --frame, or write an .mp4 or a folder.")
     backend = select_backend(options.device)
     if options.path is not None:
@@ -99,12 +100,11 @@ def main(arguments: list[str]) -> None:
         pictures = compared_pictures(reader, options.scene, backend=backend, options=options)
     else:
         pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
-    if output.suffix.lower() == ".png":
+    if ending == ".png":
         pictures = islice(pictures, 1)
-    has_sound = output.suffix.lower() == ".mp4" and reader.header.sound is not None
     is_whole_path = options.path is None or is_in_step(reader, path_length(reader, options.seconds))
     in_step = options.frame is None and is_whole_path
-    if has_sound and not in_step:
+    if ending == ".mp4" and reader.header.sound is not None and not in_step:
         print_lines(Console(stderr=True), "The video has no sound, because it does not show the stream as it is.")
     if options.frame is None and not options.compare and reader.runs != [range(len(reader))]:
         there = " and ".join(f"{run.start} to {run.stop - 1}" for run in reader.runs)
@@ -175,12 +175,10 @@ def path_pictures(
     from structgstream.evaluation.evaluate import rendered
     from structgstream.scene.state import on_device
 
-    header = reader.header
-    count = path_length(reader, seconds)
-    rig = header.rig
-    views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
+    rig, count = reader.header.rig, path_length(reader, seconds)
+    views = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
     for view, scene in _along(reader, views, frame):
-        yield rendered(on_device(scene, backend.device), header.camera(view), backend)[0]
+        yield rendered(on_device(scene, backend.device), reader.header.camera(view), backend)[0]
 
 
 def path_length(reader: "StreamReader", seconds: float | None) -> int:
@@ -208,14 +206,11 @@ def compared_pictures(
             f"--compare shows the frames before the first lost one, which is frame {len(reader.packets)}; without it "
             "render reaches all that are there."
         )
-    pairs = compared_frames(
-        reader, capture_of(reader.header, scene, frames=len(reader.packets)), backend=backend, camera=camera
-    )
-    for number, (truth, picture) in enumerate(pairs):
-        if options.frame is None or number == options.frame:
-            yield side_by_side(truth, picture)
-        if number == options.frame:
-            return
+    source = capture_of(reader.header, scene, frames=len(reader.packets))
+    pairs = compared_frames(reader, source, backend=backend, camera=camera)
+    if options.frame is not None:
+        pairs = islice(pairs, options.frame, options.frame + 1)
+    yield from starmap(side_by_side, pairs)
 
 
 def choose_camera(reader: "StreamReader", camera: str | None) -> str:

@@ -3,6 +3,8 @@
 
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import Flag, Folder, parse_options
+from structgstream.cli.options import Flag, Folder, parse_options, shown_as
 from structgstream.cli.options import StreamFile as StreamPath
 from structgstream.cli.progress import print_lines
 from structgstream.errors import MissingExtraError
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
 MAX_CONNECTIONS = 100_000
 
-Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")]
+Words = Annotated[tuple[str, ...], shown_as("NAME [NAME ...]")]
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Serve:
     """IP address to listen on. Others than the loopback address need --secret-file or --public."""
     port: int = 8080
     """Port to listen on; 0 takes one that is free."""
-    secret_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    secret_file: Annotated[Path | None, shown_as("FILE")] = None
     """Secrets that access tokens are signed with, one a line; see structgstream token. Without, no token is needed."""
     public: Flag = False
     """Listen on any address without tokens: everyone who reaches this machine sees all streams of the folder."""
@@ -60,36 +62,36 @@ class Serve:
     """Largest number of connections; while there are more, requests are answered with 503."""
 
 
+@contextmanager
+def _extra_of(port: int) -> Iterator[None]:
+    """Converts what an import in the block lacks to the extra that has it, after a check of the port."""
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port {port} is not one of 0 to 65535.")
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(error.name or "starlette", "serve") from None
+
+
 def main(arguments: list[str]) -> None:
     """Serves until Ctrl-C."""
     options = parse_options(Serve, "serve", arguments=arguments)
-    if not 0 <= options.port < 65536:
-        raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
-    try:
+    with _extra_of(options.port):
+        from structgstream.serve import listening
         from structgstream.serve.app import ServerSettings, application
-        from structgstream.serve.listening import (
-            accepted_hosts,
-            checked_address,
-            checked_origins,
-            checked_proxies,
-            run,
-            server,
-        )
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(error.name or "starlette", "serve") from None
     from structgstream.serve.access import read_keys
 
     if not 1 <= options.connections <= MAX_CONNECTIONS:
         raise UsageError(f"--connections {options.connections} is not one of 1 to {MAX_CONNECTIONS}.")
     with usage_errors():
-        address = checked_address(options.host, tokens=options.secret_file is not None, public=options.public)
+        address = listening.checked_address(options.host, tokens=options.secret_file is not None, public=options.public)
         settings = ServerSettings(
             folder=options.folder,
             keys=None if options.secret_file is None else read_keys(options.secret_file),
-            origins=checked_origins(options.allow_origin),
-            hosts=accepted_hosts(address, options.server_name),
+            origins=listening.checked_origins(options.allow_origin),
+            hosts=listening.accepted_hosts(address, options.server_name),
         )
-        proxies = checked_proxies(options.proxy)
+        proxies = listening.checked_proxies(options.proxy)
 
     def announce(url: str) -> None:
         lines = [f"The streams of {options.folder} are at {url} (Ctrl-C ends)."]
@@ -99,8 +101,8 @@ def main(arguments: list[str]) -> None:
             lines.append("Everyone who reaches this machine sees all of them.")
         print_lines(Console(), *lines)
 
-    prepared = server(application(settings), proxies=proxies, connections=options.connections)
-    run(prepared, address=address, port=options.port, on_start=announce)
+    prepared = listening.server(application(settings), proxies=proxies, connections=options.connections)
+    listening.run(prepared, address=address, port=options.port, on_start=announce)
 
 
 POLL_SECONDS = 0.5
@@ -120,9 +122,9 @@ class Play:
 
     stream: tyro.conf.Positional[StreamPath]
     """The stream file."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    capture: Annotated[Path | None, shown_as("FOLDER")] = None
     """The capture that it was made from, to compare with the cameras' pictures."""
-    port: Annotated[int, tyro.conf.arg(help_behavior_hint="")] = 0
+    port: Annotated[int, shown_as()] = 0
     """Port to listen on. Default: one that is free."""
     browser: Flag = True
     """Do not open a browser."""
@@ -133,13 +135,9 @@ class Play:
 def play(arguments: list[str]) -> None:
     """Serves until Ctrl-C."""
     options = parse_options(Play, "play", arguments=arguments)
-    if not 0 <= options.port < 65536:
-        raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
-    try:
+    with _extra_of(options.port):
         from structgstream.serve.listening import open_browser, run, server
         from structgstream.serve.play import application
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(error.name or "starlette", "serve") from None
     from structgstream.serve.pages import StreamFile
 
     stream = StreamFile(options.stream)
@@ -196,13 +194,13 @@ class Token:
 
     secret_file: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The server's secrets; the first one signs."""
-    stream: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STREAM", help_behavior_hint="")] = ""
+    stream: Annotated[tyro.conf.Positional[str], shown_as("STREAM")] = ""
     """Name of the stream, as the server lists it."""
     every: Flag = False
     """Make a token for all streams, their list and the metrics."""
     hours: float = 2.0
     """How long it is valid."""
-    address: Annotated[str, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = ""
+    address: Annotated[str, shown_as("URL")] = ""
     """The server's address, to print a link instead."""
 
 

@@ -123,11 +123,14 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
     colours = field_colors(parts)
     across = 0.34 * len(parts) + 0.3
     figure = figure_of(10.0, 4.4 + across)
+    from matplotlib.patches import Patch  # figure_of has checked that it is installed
+
     top, bottom = figure.subplots(2, 1, height_ratios=(3.6, across))
     keys = _packets(top, rows, colours)
     top.set_title(title, fontsize=11, fontweight="bold", color=INK, loc="left", pad=10)
     _shares(bottom, parts, colours)
-    figure.legend(handles=[*_named(colours), keys], fontsize=8, frameon=False, loc="outside right upper")
+    fields = [Patch(color=colour, label=field.replace("_", " ")) for field, colour in colours.items()]
+    figure.legend(handles=[*fields, keys], fontsize=8, frameon=False, loc="outside right upper")
     save_figure(figure, path)
 
 
@@ -200,12 +203,6 @@ def _shares(axis: "Axes", parts: Parts, colours: Mapping[str, str]) -> None:
     axis.set_xticks([])
     axis.spines[:].set_visible(False)
     axis.tick_params(labelsize=8, length=0)
-
-
-def _named(colours: Mapping[str, str]) -> "list[Artist]":
-    from matplotlib.patches import Patch
-
-    return [Patch(color=colour, label=field.replace("_", " ")) for field, colour in colours.items()]
 
 
 def _bright(colour: str) -> bool:

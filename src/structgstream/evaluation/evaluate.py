@@ -152,16 +152,15 @@ def evaluate(
     """
     if metrics not in get_args(MetricSelection):
         raise ConfigError(f"metrics is one of {', '.join(get_args(MetricSelection))}; got {metrics!r}.")
-    names = scored_cameras(recording.header, cameras)
+    names, size = scored_cameras(recording.header, cameras), len(recording.packets)
     check_same_rig(recording.header, source, names)
     check_same_frames(recording, source)
     views = {name: recording.header.camera(name) for name in names}
     optional_metrics = None
     if metrics == "all":
         optional_metrics = load_optional_metrics(
-            views.items(), frames=len(recording.packets), device=backend.device, lpips_weights=lpips_weights
+            views.items(), frames=size, device=backend.device, lpips_weights=lpips_weights
         )
-    size = len(recording.packets)
     selected = select_cameras(source, names)
     large = None if stored is None else select_cameras(stored, names)
     in_large = [] if large is None else frames_at_stored_size(size)
@@ -184,17 +183,28 @@ def evaluate(
     seen = [name for name in names if any(name in frame.cameras for frame in frames)]
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames if name in frame.cameras) for name in seen}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = stream_facts(recording, names) | psnr_trend(frames)
     left_out = comparison_facts(frames, names, comparison.left_out)
-    facts |= left_out
-    facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
-    facts |= {"worst": worst_facts(frames)}
-    facts |= {"stored_size_frames": in_large}
-    facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
-    facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, left_out["masked_share"])}
-    facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
+    facts = {
+        **stream_facts(recording, names),
+        **psnr_trend(frames),
+        **left_out,
+        **training_facts(frame.log for frame in frames),
+        **drawing_facts(frames),
+        "worst": worst_facts(frames),
+        "stored_size_frames": in_large,
+        "camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()},
+        "metrics": metrics,
+        "not_available": _not_available(optional_metrics, left_out["masked_share"]),
+        "lpips_weights": dict(optional_metrics.weights) if optional_metrics else {},
+    }
     peaks.end(EVALUATION)
-    machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
+    machine = {
+        **environment(),
+        "backend": backend.name,
+        "peak_memory_bytes": peaks.process_bytes.get(EVALUATION),
+        "peak_device_bytes": peaks.device_bytes.get(EVALUATION),
+        "peak_memory_kind": str(peaks.kind),
+    }
     return Report(frames, by_camera, mean, facts, machine)
 
 
@@ -224,7 +234,8 @@ class _Comparison:
         mask = frame.masks.get(camera)
         truth = blackened(frame.images[camera], mask)
         first, first_mask = self.first.setdefault(camera, (truth, mask))
-        picture, seconds = rendered(scene, self.views[camera], self.backend)
+        view, backend = self.views[camera], self.backend
+        picture, seconds = rendered(scene, view, backend)
         picture = blackened(picture, mask)
         if camera not in self.colors:
             self.colors[camera] = channel_fit(*counting(mask, picture, truth))
@@ -232,28 +243,23 @@ class _Comparison:
             picture,
             truth,
             first,
-            backend=self.backend,
+            backend=backend,
             seconds=seconds,
             color=self.colors[camera],
             mask=mask,
             first_mask=first_mask,
         )
-        ghosts = self.ghosts.find(camera, picture, truth, index=index, mask=mask)
-        view, backend = self.views[camera], self.backend
+        ghosts, more = self.ghosts.find(camera, picture, truth, index=index, mask=mask), dict[str, float | None]()
         if min(truth.shape[:2]) > 1:
-            scores = replace(scores, **half_scores(scene, view, truth, backend=backend, mask=mask))
+            more |= half_scores(scene, view, truth, backend=backend, mask=mask)
         if stored is not None:
             if camera not in stored.images:
                 raise CaptureError(f"The stored picture of camera {camera!r} in frame {index} has gone; restore it.")
             large, large_mask = stored.images[camera], stored.masks.get(camera)
-            scores = replace(scores, **stored_scores(scene, view, large, backend=backend, mask=large_mask))
+            more |= stored_scores(scene, view, large, backend=backend, mask=large_mask)
         if ghosts is not None:
-            scores = replace(
-                scores,
-                disoccluded_share=ghosts.disoccluded_share,
-                ghost_share=ghosts.share,
-                psnr_disoccluded=ghosts.psnr,
-            )
+            more |= {"disoccluded_share": ghosts.disoccluded_share, "ghost_share": ghosts.share}
+            more["psnr_disoccluded"] = ghosts.psnr
         self.left_out.setdefault(camera, []).append(0.0 if mask is None else 1.0 - float(mask.mean()))
         if self.optional_metrics is not None:
             number, last = self.before.get(camera, (-1, None))
@@ -265,7 +271,8 @@ class _Comparison:
                 mask=mask,
             )
             self.before[camera] = index, now
-            scores = replace(scores, **further)
+            more |= further
+        scores = replace(scores, **more)
         return Compared(camera, truth, picture, scores, first, both(mask, first_mask), ghosts)
 
 
@@ -328,11 +335,3 @@ def _frame_scores(
         mean=mean_scores(scores.values()) if scores else None,
         log=log,
     )
-
-
-def _evaluation_memory(peaks: PeakMeter) -> dict[str, Any]:
-    return {
-        "peak_memory_bytes": peaks.process_bytes.get(EVALUATION),
-        "peak_device_bytes": peaks.device_bytes.get(EVALUATION),
-        "peak_memory_kind": str(peaks.kind),
-    }

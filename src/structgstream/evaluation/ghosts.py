@@ -166,11 +166,4 @@ def backgrounds(source: FrameSource, names: tuple[str, ...], *, first: int, end:
         for name in frame.present(names):
             picture = blackened(frame.images[name], frame.masks.get(name))
             taken.setdefault(name, []).append(block_means(picture, reduction(picture)))
-    return {name: _median(pictures) for name, pictures in taken.items()}
-
-
-def _median(pictures: list[Picture]) -> Picture:
-    """The median of each value; for an even number of pictures the mean of the middle two."""
-    ordered = np.sort(np.stack(pictures), axis=0)
-    low, high = ordered[(len(pictures) - 1) // 2], ordered[len(pictures) // 2]
-    return ((low.astype(np.uint16) + high) // 2).astype(np.uint8)
+    return {name: np.median(np.stack(pictures), axis=0).astype(np.uint8) for name, pictures in taken.items()}

@@ -139,7 +139,10 @@ def optional_scores(
         scores["truth_flicker"] = flicker(truth, before.truth, still)
         backward = optional_metrics.search(truth, before.truth)
         seen = consistency_mask(backward, optional_metrics.search(before.truth, truth))
-        seen = _counting(seen, backward, mask, before.mask)
+        if mask is not None:
+            seen &= mask
+        if before.mask is not None:  # Only sources that counted in the frame before.
+            seen &= sampled(before.mask.astype(np.float32)[..., None], backward)[..., 0] > 0.999
         scores["e_warp"] = warping_error(picture, before.picture, backward, seen)
         if counting is None:
             true, rendered = (flip_of(*pair) for pair in zip(flip, before.flip, strict=True))
@@ -148,14 +151,6 @@ def optional_scores(
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = abs(rendered - true)  # tLP of Chu et al., 2020
     return scores, ComparedFrame(truth, picture, flip, features, mask)
-
-
-def _counting(seen: Mask, backward: NDArray[np.float32], mask: Mask | None, before: Mask | None) -> Mask:
-    """``seen`` restricted to pixels that count in this frame and whose sources counted in the frame before."""
-    seen = seen if mask is None else seen & mask
-    if before is None:
-        return seen
-    return seen & (sampled(before.astype(np.float32)[..., None], backward)[..., 0] > 0.999)
 
 
 def _usable(optional_metrics: OptionalMetrics, name: str, picture: Picture) -> Lpips | None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots of a report over time, in one picture: quality, bytes, counts, seconds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -96,18 +96,15 @@ def _known(report: Report, key: str) -> list[tuple[int, float]]:
 
 
 def _bytes(axis: "Axes", report: Report) -> None:
-    fields = {name: 0 for frame in report.frames for name in frame.field_bytes}
-    values = {name: np.array([frame.field_bytes.get(name, 0) / 1000 for frame in report.frames]) for name in fields}
-    _stacked(axis, [frame.index for frame in report.frames], values)
+    _stacked(axis, report, [{name: size / 1000 for name, size in one.field_bytes.items()} for one in report.frames])
     axis.set_ylabel("kB", fontsize=9)
 
 
 def _seconds(axis: "Axes", report: Report) -> None:
-    stages = {name: 0 for frame in report.frames for name in _stages(frame)}
-    values = {name: np.array([_stages(frame).get(name, 0.0) for frame in report.frames]) for name in stages}
-    online = [sum(_stages(frame).values()) for frame in report.frames if frame.index > 0]
-    _stacked(axis, [frame.index for frame in report.frames], values)
-    first = sum(_stages(report.frames[0]).values())
+    stages = [_stages(frame) for frame in report.frames]
+    _stacked(axis, report, stages)
+    first = sum(stages[0].values())
+    online = [sum(own.values()) for frame, own in zip(report.frames, stages) if frame.index > 0]
     if online and first > 3 * max(online):
         axis.set_ylim(0, 1.3 * max(online))
         axis.annotate(
@@ -125,8 +122,11 @@ def _counts(axis: "Axes", report: Report) -> None:
     axis.set_ylabel("count", fontsize=9)
 
 
-def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None:
-    """Stacked bars, the largest field lowest, without those below a thousandth of the total."""
+def _stacked(axis: "Axes", report: Report, parts: Sequence[Mapping[str, float]]) -> None:
+    """Stacked bars of each frame's parts, the largest lowest, without those below a thousandth of the total."""
+    index = [frame.index for frame in report.frames]
+    names = dict.fromkeys(name for own in parts for name in own)
+    values = {name: np.array([own.get(name, 0.0) for own in parts]) for name in names}
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
@@ -134,18 +134,8 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
     looks = cycle(product((None, "////", "...."), COLORS))
     for name in shown:
         hatch, colour = (None, OTHER) if name == "other" else next(looks)
-        label = name.replace("_", " ")
-        axis.bar(
-            index,
-            values[name],
-            bottom=base,
-            width=0.85,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            lw=0,
-            label=label,
-        )
+        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "lw": 0, "label": name.replace("_", " ")}
+        axis.bar(index, values[name], bottom=base, width=0.85, **style)
         base = base + values[name]
 
 

@@ -2,6 +2,7 @@
 """Recordings that can be evaluated (one drawable per frame, of this method or another), and the captures of streams."""
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -213,14 +214,12 @@ def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
     header, packets = reader.header, reader.packets
     seconds = shown_seconds(packets, header.fps)
     packet_bytes = sum(info.bytes for info in packets)
-    fields: dict[str, int] = {}
+    fields = Counter[str]()
     for info in packets:
-        for name, size in info.field_bytes.items():
-            fields[name] = fields.get(name, 0) + size
-    keys = [info for info in packets if info.kind == PacketKind.KEY]
+        fields.update(info.field_bytes)
     return {
         "frames": len(packets),
-        "key_frames": len(keys),
+        "key_frames": sum(info.kind == PacketKind.KEY for info in packets),
         "fps": header.fps,
         "codec": header.codec,
         "complete": reader.complete,
@@ -229,7 +228,7 @@ def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
         "header_bytes": reader.header_bytes,
         "packet_bytes": packet_bytes,
         "total_bytes": reader.total_bytes,
-        "field_bytes": fields,
+        "field_bytes": dict(fields),
         "megabits_per_second": packet_bytes * 8e-6 / seconds,
         "megabits_per_second_with_header": reader.total_bytes * 8e-6 / seconds,
         "metadata": dict(header.metadata),
@@ -242,22 +241,17 @@ def training_facts(logs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     if not logs:
         return {}
     online = [log["total_seconds"] for log in logs if log["index"] > 0]
-    return {
-        "seconds_first": next((log["total_seconds"] for log in logs if log["index"] == 0), None),
-        "seconds_online_mean": float(np.mean(online)) if online else None,
-        "peak_memory_bytes": max(log["peak_memory_bytes"] or 0 for log in logs) or None,
-        "peak_memory_bytes_by_stage": _largest_by_stage(logs),
-    }
-
-
-def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
-    """The largest peak of each stage, separately for frame 0 and for later frames."""
-    largest: dict[str, int] = {}
+    largest: dict[str, int] = {}  # of frame 0 and of later frames, by stage
     for log in logs:
         part = "online" if log["index"] else "first frame"
         for stage, size in log.get("peak_memory_bytes_by_stage", {}).items():
             largest[f"{part}, {stage}"] = max(size, largest.get(f"{part}, {stage}", 0))
-    return largest
+    return {
+        "seconds_first": next((log["total_seconds"] for log in logs if log["index"] == 0), None),
+        "seconds_online_mean": float(np.mean(online)) if online else None,
+        "peak_memory_bytes": max(log["peak_memory_bytes"] or 0 for log in logs) or None,
+        "peak_memory_bytes_by_stage": largest,
+    }
 
 
 def comparison_facts(

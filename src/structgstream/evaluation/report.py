@@ -53,52 +53,30 @@ OF_DISOCCLUDED = ("ghost_share", "psnr_disoccluded")
 
 @dataclass(frozen=True)
 class FrameScores:
-    """One frame of the stream.
+    """One frame of the stream."""
 
-    Args:
-        index: frame number in the stream.
-        pts_seconds: presentation time.
-        kind: ``key`` or ``delta``.
-        bytes: length of the packet's record in the file.
-        field_bytes: bytes by field of the state table.
-        anchors: anchors of the decoded scene.
-        free: free Gaussians of the decoded scene; all Gaussians for another method's drawable.
-        decode_seconds: wall-clock time from the file to the scene on its device.
-        cameras: scores by camera name, without cameras that are absent from the frame.
-        mean: mean of these scores; None without any.
-        log: the frame's entry in the trainer's log; empty without a log.
-    """
-
-    index: int
-    pts_seconds: float
-    kind: str
-    bytes: int
-    field_bytes: Mapping[str, int]
-    anchors: int
-    free: int
-    decode_seconds: float
-    cameras: Mapping[str, Scores]
-    mean: Scores | None
-    log: Mapping[str, Any]
+    index: int  # frame number in the stream
+    pts_seconds: float  # presentation time
+    kind: str  # key or delta
+    bytes: int  # length of the packet's record in the file
+    field_bytes: Mapping[str, int]  # bytes by field of the state table
+    anchors: int  # of the decoded scene
+    free: int  # free Gaussians of the decoded scene; all Gaussians of another method's drawable
+    decode_seconds: float  # wall-clock time from the file to the scene on its device
+    cameras: Mapping[str, Scores]  # by name of the camera, without those that are absent from the frame
+    mean: Scores | None  # of these scores; None without any
+    log: Mapping[str, Any]  # the frame's entry in the trainer's log; empty without a log
 
 
 @dataclass(frozen=True)
 class Report:
-    """An evaluation.
+    """An evaluation."""
 
-    Args:
-        frames: one entry for each frame, in order.
-        cameras: mean over the frames with a picture, by camera name.
-        mean: mean over all pictures.
-        stream: facts of the file, sizes and the course of PSNR over time (``stream_facts``).
-        environment: the machine that rendered.
-    """
-
-    frames: Sequence[FrameScores]
-    cameras: Mapping[str, Scores]
-    mean: Scores
-    stream: Mapping[str, Any]
-    environment: Mapping[str, Any]
+    frames: Sequence[FrameScores]  # one entry for each frame, in order
+    cameras: Mapping[str, Scores]  # mean over the frames with a picture, by name of the camera
+    mean: Scores  # over all pictures
+    stream: Mapping[str, Any]  # facts of the file, sizes and the course of PSNR over time (``stream_facts``)
+    environment: Mapping[str, Any]  # the machine that rendered
 
 
 def mean_scores(scores: Iterable[Scores]) -> Scores:

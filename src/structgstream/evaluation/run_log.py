@@ -10,7 +10,8 @@ refused. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind``
 import json
 import logging
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,14 +64,9 @@ def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
 
 def log_entry(report: "FrameReport") -> dict[str, Any]:
     """One line of the log: the frame's report as plain values, and seconds and memory of the whole frame."""
-    entry = asdict(report)
-    del entry["peak_device_bytes"]
-    if not report.absent:
-        del entry["absent"]
-    if report.begins is None:
-        del entry["begins"]
-    if report.mean_of == 1:
-        del entry["mean_of"]
+    # Not in the log where they are usual; the peaks of a device have another name below.
+    usual = {"absent": (), "begins": None, "mean_of": 1, "peak_device_bytes": report.peak_device_bytes}
+    entry = {name: value for name, value in asdict(report).items() if name not in usual or value != usual[name]}
     return entry | {
         "kind": report.kind.name.lower(),
         "train_psnr": report.train_psnr if math.isfinite(report.train_psnr) else None,
@@ -84,18 +80,22 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
 
 def read_log(stream: Path) -> dict[int, dict[str, Any]]:
     """Entries by frame number; the later of two entries for a frame; lines truncated by a crash are skipped."""
-    try:
-        lines = log_path(stream).read_text().splitlines()
-    except (OSError, UnicodeDecodeError):
-        return {}
     entries = {}
-    for line in lines:
-        try:
-            entry = json.loads(line)
+    for entry in json_lines(log_path(stream)):
+        with suppress(ValueError, KeyError, TypeError, OverflowError):
             entries[int(entry["index"])] = entry
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            continue
     return entries
+
+
+def json_lines(path: Path) -> Iterator[Any]:
+    """The values in the lines of a file, without those that are no JSON; none if the file cannot be read."""
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError):
+        return
+    for line in lines:
+        with suppress(ValueError, RecursionError):
+            yield json.loads(line)
 
 
 def log_of(stream: Path, sizes: Mapping[int, int]) -> dict[int, dict[str, Any]]:

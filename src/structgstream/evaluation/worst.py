@@ -35,8 +35,8 @@ WINDOW_SHARE = 0.25
 def badness(scores: Scores, reason: Reason) -> float | None:
     """Measure of a picture's error, larger is worse; None if it is not bad for this reason."""
     if reason == "changed":
-        few = scores.psnr_changed is None or scores.changed_share < MIN_SHARE
-        return None if few or scores.psnr_changed is None else -scores.psnr_changed
+        enough = scores.changed_share >= MIN_SHARE
+        return -scores.psnr_changed if enough and scores.psnr_changed is not None else None
     return (scores.ghost_share or 0.0) * (scores.disoccluded_share or 0.0) or None
 
 

@@ -217,8 +217,7 @@ class LocalEngine:
 
     def start(self, task: Task, *, gpus: int) -> None:
         # A task without a GPU prefers a slot without one.
-        order = sorted(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
-        slot = order[0]
+        slot = min(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
         self._free.remove(slot)
         self._running[task.name] = (CommandProcess(task, environment=slot.environment(gpus=gpus)), slot)
 
@@ -226,8 +225,7 @@ class LocalEngine:
         waited_for([process for process, _ in self._running.values()], seconds)
         results = []
         for name, (process, slot) in list(self._running.items()):
-            result = process.ended()
-            if result is not None:
+            if (result := process.ended()) is not None:
                 del self._running[name]
                 self._free.append(slot)
                 results.append(result)

@@ -139,40 +139,32 @@ class _Sums:
     def __init__(self, count: int, like: Tensor, degree: int) -> None:
         terms = (degree + 1) ** 2
         self.degree = degree
-        self.means, self.weight = like.new_zeros(count, 3), like.new_zeros(count)
-        self.seen, self.drawn, self.opacity = like.new_zeros(count), like.new_zeros(count), like.new_zeros(count)
+        self.means, self.seen, self.weight = like.new_zeros(count, 3), like.new_zeros(count), like.new_zeros(count)
         self.log_scales, self.quats = like.new_zeros(count, 3), like.new_zeros(count, 4)
         self.normal, self.right = like.new_zeros(count, terms, terms), like.new_zeros(count, terms, 3)
 
     def add(self, gaussians: Gaussians, camera: Camera, *, seen: Tensor) -> None:
         """Adds one camera's Gaussians; ``seen`` are the ids of all Gaussians of its visible anchors."""
-        ids = gaussians.ids
+        ids, weight = gaussians.ids, gaussians.opacities
         self.seen[seen] += 1.0
-        self.drawn[ids] += 1.0
-        self.opacity[ids] += gaussians.opacities
-        self.means[ids] = gaussians.means
-        weight = gaussians.opacities
         self.weight[ids] += weight
-        self._add_shapes(gaussians, weight)
-        center = camera.viewport(gaussians.means).center
-        basis = sh_basis(torch.nn.functional.normalize(gaussians.means - center, dim=1), self.degree)
-        weighted = basis * weight[:, None]
-        self.normal[ids] += weighted[:, :, None] * basis[:, None, :]
-        self.right[ids] += weighted[:, :, None] * (gaussians.colors - 0.5)[:, None, :]
-
-    def _add_shapes(self, gaussians: Gaussians, weight: Tensor) -> None:
-        ids = gaussians.ids
+        self.means[ids] = gaussians.means
         quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
         self.log_scales[ids] += weight[:, None] * gaussians.scales.log()
         before = self.quats[ids]
         # A quaternion and its negative are the same rotation; the sign that agrees with the sum so far is used.
         side = torch.where((before * quats).sum(1, keepdim=True) < 0.0, -1.0, 1.0)
         self.quats[ids] = before + weight[:, None] * side * quats
+        center = camera.viewport(gaussians.means).center
+        basis = sh_basis(torch.nn.functional.normalize(gaussians.means - center, dim=1), self.degree)
+        weighted = basis * weight[:, None]
+        self.normal[ids] += weighted[:, :, None] * basis[:, None, :]
+        self.right[ids] += weighted[:, :, None] * (gaussians.colors - 0.5)[:, None, :]
 
     def result(self) -> BakedGaussians:
         """The averages and the fit."""
-        opacities = self.opacity / self.seen.clamp(min=1.0)
-        rows = torch.nonzero((self.drawn > 0) & (self.weight > 0) & (opacities >= MIN_OPACITY))[:, 0]
+        opacities = self.weight / self.seen.clamp(min=1.0)
+        rows = torch.nonzero(opacities >= MIN_OPACITY)[:, 0]
         if not len(rows):
             raise StreamError("No training camera sees any Gaussian of the scene, so there is nothing to export.")
         weight = self.weight[rows]

@@ -56,32 +56,20 @@ SUFFIXES: Mapping[str, Format] = {suffix: name for name, info in FORMATS.items()
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Options of frames as plain 3D Gaussians.
+    """Options of frames as plain 3D Gaussians."""
 
-    Args:
-        degree: degree of the spherical harmonics; None for 1, or for 0 in a format without.
-        low_pass: variance by which Gaussians are widened, squared training pixels (``bake.with_low_pass``).
-        box: two opposite corners, in the capture's units; Gaussians with means outside are left out.
-        min_opacity: Gaussians below this opacity are left out.
-        max_splats: largest number of Gaussians of a frame; the smallest and most transparent are left out.
-        pad_sh: write all 45 ``f_rest`` properties of a ``.ply``, which some importers need.
-        spz_version: version of ``.spz``.
-    """
-
-    degree: int | None = None
-    low_pass: float = 0.0
+    degree: int | None = None  # degree of the spherical harmonics; None for 1, or for 0 in a format without
+    low_pass: float = 0.0  # variance by which Gaussians are widened, squared training pixels (bake.with_low_pass)
+    # two opposite corners, in the capture's units; Gaussians with means outside are left out
     box: tuple[float, float, float, float, float, float] | None = None
-    min_opacity: float = 0.0
-    max_splats: int | None = None
-    pad_sh: bool = False
+    min_opacity: float = 0.0  # Gaussians below this opacity are left out
+    max_splats: int | None = None  # largest number of Gaussians; the smallest and most transparent are left out
+    pad_sh: bool = False  # write all 45 f_rest properties of a .ply, which some importers need
     spz_version: SpzVersion = 2
 
     def check(self, format: Format) -> None:
-        """Check the values, and that ``format`` supports them.
-
-        Raises:
-            ConfigError: a value is out of range, or the format does not support it.
-        """
+        """Check the values, and that ``format`` supports them. Raises ConfigError if it does not, or a value is out of
+        range."""
         highest = FORMATS[format].max_degree
         if self.degree is not None and not 0 <= self.degree <= MAX_SH_DEGREE:
             raise ConfigError(f"--sh-degree {self.degree} is not one of 0 to {MAX_SH_DEGREE}.")

@@ -123,13 +123,16 @@ def _first_three(quats: Tensor) -> bytes:
     return _bytes(torch.where(quats[:, :1] < 0.0, -quats, quats)[:, 1:] * 127.5 + 127.5).tobytes()
 
 
+def _smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.floating]]:
+    """The place ``[N]`` of the largest component of each of ``[N, 4]``, and the others ``[N, 3]`` if it is positive."""
+    largest = np.abs(quats).argmax(1)
+    signed = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
+    return largest, signed[np.arange(4) != largest[:, None]].reshape(-1, 3)
+
+
 def _smallest_three_bits(quats: Tensor) -> bytes:
     """32 bits: the place of the largest of x, y, z, w, and sign and 9-bit magnitude of the others in this order."""
-    xyzw = quats[:, [1, 2, 3, 0]].cpu().double().numpy()
-    rows = np.arange(len(xyzw))
-    largest = np.abs(xyzw).argmax(1)
-    xyzw = np.where(xyzw[rows, largest] < 0.0, -1.0, 1.0)[:, None] * xyzw
-    others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    largest, others = _smallest_three(quats[:, [1, 2, 3, 0]].cpu().double().numpy())
     magnitudes = np.minimum(np.floor(np.abs(others) * math.sqrt(2.0) * 511.0 + 0.5), 511).astype(np.uint32)
     packed = largest.astype(np.uint32)
     for column in range(3):
@@ -247,9 +250,7 @@ def _sums(group: NDArray[np.int64], rows: Floats, count: int) -> NDArray[np.floa
 
 def _smallest_three_bytes(quats: Floats) -> Bytes:
     """The three smaller components of wxyz, and 252 plus the index of the largest."""
-    largest = np.abs(quats).argmax(1)
-    signed = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
-    others = signed[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    largest, others = _smallest_three(quats)
     packed = np.rint((others * math.sqrt(0.5) + 0.5) * 255).clip(0, 255)
     return np.concatenate([packed, 252 + largest[:, None]], axis=1).astype(np.uint8)
 

@@ -59,17 +59,15 @@ class UsdFile:
         prim = self._stage.DefinePrim("/Splats", PRIM_TYPE)
         self._stage.SetDefaultPrim(prim)
         types = Sdf.ValueTypeNames
-        self._attributes = {
-            name: prim.CreateAttribute(name, type, custom=False)
-            for name, type in {
-                "positions": types.Point3fArray,
-                "orientations": types.QuatfArray,
-                "scales": types.Float3Array,
-                "opacities": types.FloatArray,
-                "radiance:sphericalHarmonicsCoefficients": types.Float3Array,
-                "extent": types.Float3Array,
-            }.items()
+        attributes = {
+            "positions": types.Point3fArray,
+            "orientations": types.QuatfArray,
+            "scales": types.Float3Array,
+            "opacities": types.FloatArray,
+            "radiance:sphericalHarmonicsCoefficients": types.Float3Array,
+            "extent": types.Float3Array,
         }
+        self._attributes = {name: prim.CreateAttribute(name, kind, custom=False) for name, kind in attributes.items()}
         self._degree = prim.CreateAttribute(
             "radiance:sphericalHarmonicsDegree", types.Int, False, Sdf.VariabilityUniform
         )
@@ -239,23 +237,8 @@ def frame_name(number: int, format: Format) -> str:
 def write_gaussians(
     path: Path, gaussians: BakedGaussians, *, format: Format, options: FrameOptions | None = None
 ) -> Path:
-    """Writes a file of ``gaussians`` atomically, and creates its folder if necessary.
-
-    An existing file at ``path`` is replaced only when the new one is complete.
-
-    Args:
-        gaussians: the Gaussians, in the file's units, OpenCV axes.
-        format: format of the file; ``splat`` supports only degree 0.
-
-    Returns:
-        ``path``.
-
-    Raises:
-        ConfigError: the format does not support these Gaussians.
-        StreamError: a value is not finite, or a scale is not positive.
-        StorageError: the file cannot be written.
-        MissingExtraError: a package is not installed.
-    """
+    """Writes a file of ``gaussians``, in its units and OpenCV axes, atomically; returns ``path``. A missing folder is
+    created. Raises errors as :func:`open_output`."""
     check_finite(gaussians)
     atomic_write(path, FORMAT_BYTES[format](gaussians, options or FrameOptions()), new_folder=True)
     return path
@@ -321,13 +304,10 @@ def write_frames(
 
     Args:
         numbers: numbers of the frames; a single one if ``output`` is a file for one frame.
-        output: a file, or a folder for ``frame_000000.ply`` and so on (``write.open_output``).
+        output: see :func:`open_output`.
         options: what is fitted and left out; None for the defaults.
 
-    Raises:
-        StreamError: a frame is lost, or the options leave no Gaussian.
-        StorageError: a file cannot be written.
-        MissingExtraError: a package of the format is not installed.
+    Raises errors as :func:`open_output`, and StreamError if a frame is lost, or the options leave no Gaussian.
     """
     options = options or FrameOptions()
     header = reader.header
@@ -363,12 +343,10 @@ def selected(gaussians: BakedGaussians, options: FrameOptions) -> BakedGaussians
 
 def baking_loss(scene: Scene, baked: BakedGaussians, reader: StreamReader, backend: Backend) -> BakingLoss:
     """Compares pictures of ``baked``, before ``with_low_pass``, with those of ``scene`` at the stream's cameras."""
-    header = reader.header
-    training, held_out = ([header.camera(n) for n in names] for names in (header.rig.training, header.rig.testing))
-    return BakingLoss(
-        pictures_psnr(scene, baked, training, backend),
-        pictures_psnr(scene, baked, held_out, backend) if held_out else None,
-    )
+    rig = reader.header.rig
+    training, held_out = ([reader.header.camera(name) for name in names] for names in (rig.training, rig.testing))
+    loss = pictures_psnr(scene, baked, training, backend)
+    return BakingLoss(loss, pictures_psnr(scene, baked, held_out, backend) if held_out else None)
 
 
 def pictures_psnr(one: Drawable, other: Drawable, cameras: Sequence[Camera], backend: Backend) -> float:

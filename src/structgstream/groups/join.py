@@ -16,13 +16,12 @@ from tempfile import TemporaryDirectory
 from typing import cast
 
 from structgstream.atomic_files import atomic_file, atomic_write
-from structgstream.codec.container.records import FRAME, PREFIX, pack_index, read_record
-from structgstream.codec.packets import StreamHeader, unpack_header
+from structgstream.codec.container.records import FRAME, pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, allocate_slots
 from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
-from structgstream.groups.segment_file import open_segment
+from structgstream.groups.segment_file import Segment, open_segment, verified_record
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.training.online.patching import IDS_PER_FRAME
 
@@ -60,21 +59,20 @@ def join_segments(
     """
     if workers < 1 or (workers > 1 and backend is not None and backend.name == "cuda"):
         raise ConfigError(f"{workers} workers cannot blend borders; use one on a GPU, and one or more on CPUs.")
-    init, ordered, lengths = _in_order(paths)
+    first, ordered, lengths = _in_order(paths)
     # A blended stream is checked as a single group.
     firsts = [0, *accumulate(lengths)][:-1] if backend is None else [0]
     runs = [] if backend is None or workers == 1 else runs_of(lengths, workers=workers)
     if backend is not None and len(runs) > 1:
         records = _blended_by_workers(ordered, runs, output, backend, workers, on_border or (lambda border: None))
     else:
-        blender = None if backend is None else GroupBlender(header_of(init), backend, on_border=on_border)
+        blender = None if backend is None else GroupBlender(first.header, backend, on_border=on_border)
         records = _records(ordered, blender)
     entries: list[tuple[int, int, int]] = []
     with atomic_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:
-        file.write(init)
+        file.write(first.init)
         for data in records:
-            record = read_record(data, 0)
-            assert record is not None, "verified when the segment was opened"
+            record = verified_record(data)
             entries.append((FRAME.unpack_from(record.payload)[0], record.type, file.tell()))
             file.write(data)
         file.write(pack_index(entries, file.tell()))
@@ -138,7 +136,7 @@ def main(arguments: list[str]) -> None:
     """Blends a run; writes its borders as a line of JSON, followed by the records of its packets."""
     device, output, previous, *paths = arguments
     before, borders = open_segment(Path(previous)), list[Border]()
-    blender = GroupBlender(header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append)
+    blender = GroupBlender(before.header, select_backend(cast(BackendName, device)), on_border=borders.append)
     blender.follow(before)
     records = b"".join(_records([Path(path) for path in paths], blender))
     atomic_write(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
@@ -150,28 +148,19 @@ def read_run(path: Path) -> tuple[list[Border], list[bytes]]:
     at = data.index(b"\n") + 1
     borders = [Border(**border) for border in json.loads(data[:at])]
     while at < len(data):
-        record = read_record(data, at)
-        assert record is not None, "the file was written whole"
-        records.append(data[at : record.end])
-        at = record.end
+        end = verified_record(data, at).end
+        records.append(data[at:end])
+        at = end
     return borders, records
 
 
-def header_of(init: bytes) -> StreamHeader:
-    """The header in the bytes of prefix and init record."""
-    record = read_record(init, PREFIX.size)
-    assert record is not None, "verified when the segment was opened"
-    return unpack_header(record.payload)
-
-
-def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
-    """Prefix with init record, and paths and numbers of frames of the segments in order, which form one stream."""
+def _in_order(paths: Sequence[Path]) -> tuple[Segment, list[Path], list[int]]:
+    """The first segment, and paths and numbers of frames of all in order, which form one stream."""
     if not paths:
         raise ConfigError("There is nothing to join; give the segments of one stream.")
     found = [(path, replace(open_segment(path), data=b"")) for path in paths]
     found.sort(key=lambda entry: entry[1].identity.first)
-    first_path, first = found[0]
-    expected = 0
+    (first_path, first), expected = found[0], 0
     for path, segment in found:
         identity = segment.identity
         if not segment.complete:
@@ -187,7 +176,7 @@ def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
             low, high = sorted((identity.first, expected))
             raise StreamError(f"Frames {low} to {high - 1} {what} before {path}; a stream needs every frame once.")
         expected = identity.end
-    return first.init, [path for path, _ in found], [len(segment.entries) for _, segment in found]
+    return first, [path for path, _ in found], [len(segment.entries) for _, segment in found]
 
 
 def check_births(path: Path, firsts: Sequence[int]) -> None:

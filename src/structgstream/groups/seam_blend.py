@@ -21,16 +21,16 @@ the frame before in equal steps, because a jump would be visible everywhere.
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 
 import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig, enlargement
-from structgstream.codec.container.records import PACKET_KINDS, RECORD_TYPES, packed, read_record
-from structgstream.codec.packets import Packet, StreamHeader, parse_packet
+from structgstream.codec.container.records import RECORD_TYPES, packed
+from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
-from structgstream.groups.segment_file import Segment
+from structgstream.groups.segment_file import Segment, packet_of
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
@@ -273,8 +273,7 @@ class GroupBlender:
     def __init__(
         self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None
     ) -> None:
-        self._header = header
-        self._backend = backend
+        self._header, self._backend = header, backend
         self._rig = header.similarity.rig(header.rig)
         self._shown: deque[Scene] = deque(maxlen=2)
         self._on_border = on_border or (lambda border: None)
@@ -293,7 +292,7 @@ class GroupBlender:
                 yield data
             return
         frames = self._decoded(segment)
-        begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
+        begun = [*islice(frames, 2)]
         seam_blend = self._begin(begun[0][0].index, [scene for _, scene in begun])
         encoder = SceneEncoder(self._header)
         for packet, scene in chain(begun, frames):
@@ -332,8 +331,5 @@ class GroupBlender:
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)
-        for data in segment.records():
-            record = read_record(data, 0)
-            assert record is not None, "verified when the segment was opened"
-            packet = parse_packet(record.payload, PACKET_KINDS[record.type])
+        for packet in map(packet_of, segment.records()):
             yield packet, decoder.decode(packet)

@@ -32,7 +32,7 @@ from structgstream.codec.container.records import (
     packed,
     read_record,
 )
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.codec.reader import PacketInfo
 from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.errors import ConfigError, StreamError
@@ -78,6 +78,11 @@ class Segment:
     complete: bool  # whether every frame is present, index and footer are valid, and nothing follows
     reason: str | None  # why the segment is not complete; None if it is
 
+    @property
+    def header(self) -> StreamHeader:
+        """Content of the init record."""
+        return unpack_header(verified_record(self.init, PREFIX.size).payload)
+
     def record(self, number: int) -> bytes:
         """The record of the segment's packet ``number``, framing included."""
         start = self.entries[number][2]
@@ -116,10 +121,8 @@ def open_segment(path: Path) -> Segment:
             break
         entries.append((frame, record.type, record.offset))
         end = record.end
-    frames = identity.end - identity.first
-    closing = pack_index(entries, end)
-    complete = len(entries) == frames and data[end:] == closing
-    reason = None
+    frames, reason = identity.end - identity.first, None
+    complete = len(entries) == frames and data[end:] == pack_index(entries, end)
     if not complete:
         cut = "its index is damaged" if len(entries) == frames else incomplete_reason(data, end)
         reason = f"it has {len(entries)} of {frames} frames; {cut}"
@@ -169,15 +172,14 @@ class SegmentSink:
     def write(self, packet: Packet) -> int:
         """Appends one packet; returns its size in bytes. Raises StorageError if it cannot be written, or the disk is
         nearly full; earlier packets are not affected."""
-        record = packed(RECORD_TYPES[packet.kind], packet.payload)
+        kind, partial, frames = RECORD_TYPES[packet.kind], self._file.partial, len(self._entries)
+        record = packed(kind, packet.payload)
         self._largest = max(self._largest, len(record))
-        closing = (len(self._entries) + 2) * INDEX_ENTRY.size
-        where, frames = str(self._file.partial), len(self._entries)
-        free = free_bytes(self._file.partial)
-        check_room(free, largest=self._largest, closing=closing, where=where, frames=frames)
+        closing = (frames + 2) * INDEX_ENTRY.size
+        check_room(free_bytes(partial), largest=self._largest, closing=closing, where=str(partial), frames=frames)
         at = self._file.size
         size = self._file.append(record)
-        self._entries.append((packet.index, int(RECORD_TYPES[packet.kind]), at))
+        self._entries.append((packet.index, int(kind), at))
         return size
 
     def close(self) -> None:
@@ -218,7 +220,7 @@ class GroupSoFar:
         """Facts of the group's packets."""
         return [
             PacketInfo(packet.kind, packet.index, packet.pts_seconds, 0, len(record), packet.field_bytes)
-            for packet, record in zip(map(_packet, self.records), self.records, strict=True)
+            for packet, record in zip(map(packet_of, self.records), self.records, strict=True)
         ]
 
     @property
@@ -234,12 +236,10 @@ class GroupSoFar:
         if index < self.first:
             yield self.base.packet
             return
-        number = index - self.first
-        first = number
-        while _packet(self.records[first]).kind is not PacketKind.KEY:
-            first -= 1
-        for record in self.records[first : number + 1]:
-            yield _packet(record)
+        needed = [packet_of(self.records[index - self.first])]
+        while needed[-1].kind is not PacketKind.KEY:
+            needed.append(packet_of(self.records[index - self.first - len(needed)]))
+        yield from reversed(needed)
 
     def scene(self, index: int) -> Scene:
         """The decoded frame ``index``, or frame 0 for those before the group."""
@@ -249,9 +249,16 @@ class GroupSoFar:
         return scene
 
 
-def _packet(record: bytes) -> Packet:
-    found = read_record(record, 0)
+def verified_record(data: bytes, offset: int = 0) -> Record:
+    """The record at ``offset``, which was verified before."""
+    found = read_record(data, offset)
     assert found is not None, "verified before"
+    return found
+
+
+def packet_of(record: bytes) -> Packet:
+    """The packet of a verified record. Raises StreamError if it does not follow the format."""
+    found = verified_record(record)
     return parse_packet(found.payload, PACKET_KINDS[found.type])
 
 
@@ -287,10 +294,8 @@ def _matching(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment
         ) from None
     except StreamError:
         return None
-    if found.identity == identity and found.init == base.init and (identity.first or found.entries):
-        return found
     if found.identity == identity:
-        return None
+        return found if found.init == base.init and (identity.first or found.entries) else None
     names = [name for name in vars(identity) if getattr(found.identity, name) != getattr(identity, name)]
     raise ConfigError(
         f"{path} is a group of another {' and '.join(names)}; give the same header, track, capture and options, "

@@ -20,7 +20,6 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.groups.base import GroupBase, fingerprint
 from structgstream.groups.segment_file import GroupSoFar, Segment
 from structgstream.groups.track_file import (
-    Groups,
     TrackFile,
     TrackHead,
     TrackStart,
@@ -95,7 +94,11 @@ def track_capture(
     )
     found = _existing(path, head)
     if found is not None and found.groups is not None:
-        _end(path, found.groups)
+        # The pass may have been killed after its last record.
+        if not groups_path(path).exists():
+            write_groups(path, found.groups)
+        if not path.exists():
+            name_finished(path)
         return
     if not options.quiet:
         write_groups(path, _groups(options, len(source), {}))
@@ -114,14 +117,6 @@ def track_capture(
         writer.finish(len(source), groups)
     finally:
         writer.close()
-
-
-def _end(path: Path, groups: Groups) -> None:
-    """Completes the work of a pass that was killed after its last record."""
-    if not groups_path(path).exists():
-        write_groups(path, groups)
-    if not path.exists():
-        name_finished(path)
 
 
 def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
@@ -193,12 +188,12 @@ class Pass:
     @classmethod
     def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":
         """The state at ``start``, or at frame 0."""
-        online, scene = base.config.online, on_device(base.scene(), backend.device)
+        scene, step = on_device(base.scene(), backend.device), base.position_step
         rig = base.header.similarity.rig(base.header.rig)
-        tracker = Tracker(config, online.motion, rig, backend)
-        step = base.position_step
-        tracked = Tracked.at_rest(scene) if start is None else tracked_at(scene, start, step=step)
-        return cls(scene, tracker, step, tracked, 0 if start is None else start.frame)
+        tracker = Tracker(config, base.config.online.motion, rig, backend)
+        if start is None:
+            return cls(scene, tracker, step, Tracked.at_rest(scene), 0)
+        return cls(scene, tracker, step, tracked_at(scene, start, step=step), start.frame)
 
     def start(self, changed: list[float]) -> TrackStart:
         """The start record of the last frame; rounds the state to it."""

@@ -195,12 +195,7 @@ class SegmentTask:
 
 
 def fit_segment(
-    path: Path,
-    task: SegmentTask,
-    backend: Backend,
-    *,
-    overwrite: bool = False,
-    on_step: StepListener | None = None,
+    path: Path, task: SegmentTask, backend: Backend, *, overwrite: bool = False, on_step: StepListener | None = None
 ) -> Run | None:
     """Fits a group into the segment ``path``; resumes an interrupted fit.
 

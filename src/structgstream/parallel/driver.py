@@ -4,7 +4,7 @@ start, and the join.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -43,30 +43,31 @@ class Unit:
 
     def header_task(self, parts: Parts) -> Task:
         """Fits frame 0, which all groups share."""
-        argv = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
-        command = (*argv, "--sound", "none", *self.header, *self.device)  # groups carry no sound
-        return Task(HEADER, command, str(parts.header), parts.log(HEADER))
+        words = ("reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
+        # groups carry no sound
+        return self._task(parts, HEADER, parts.header, *words, "--sound", "none", *self.header, *self.device)
 
     def track_task(self, parts: Parts) -> Task:
         """The tracking pass."""
-        argv = (*self.program, "track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
+        words = ("track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
         count = () if self.frames is None else ("--frames", str(self.frames))
-        command = (*argv, *count, *self.track, *self.device)
-        variables = {} if self.track_threads is None else thread_environment(self.track_threads)
-        return Task(TRACK, command, str(parts.track), parts.log(TRACK), variables)
+        task = self._task(parts, TRACK, parts.track, *words, *count, *self.track, *self.device)
+        return task if self.track_threads is None else replace(task, environment=thread_environment(self.track_threads))
 
     def group_task(self, parts: Parts, first: int, end: int) -> Task:
         """Fits a group to a segment."""
-        name, segment = group_name(first, end), str(parts.segment(first, end))
-        argv = (*self.program, "fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
-        command = (*argv, "--frames", f"{first}:{end}", "-o", segment, *self.device)
-        return Task(name, command, segment, parts.log(name))
+        segment = parts.segment(first, end)
+        words = ("fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
+        words += ("--frames", f"{first}:{end}", "-o", str(segment))
+        return self._task(parts, group_name(first, end), segment, *words, *self.device)
 
     def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
         """Joins all segments to the stream."""
         segments = [str(parts.segment(first, end)) for first, end in groups]
-        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.join)
-        return Task(JOIN, command, str(output), parts.log(JOIN))
+        return self._task(parts, JOIN, output, "join", *segments, "-o", str(output), "--overwrite", *self.join)
+
+    def _task(self, parts: Parts, name: str, result: Path, *words: str) -> Task:
+        return Task(name, (*self.program, *words), str(result), parts.log(name))
 
 
 POLL_SECONDS = 0.5

@@ -10,13 +10,14 @@ import json
 import re
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from structgstream.atomic_files import atomic_write, lock_file, open_lockable
 from structgstream.errors import ConfigError, StorageError
+from structgstream.evaluation.run_log import json_lines
 from structgstream.executors.tasks import TaskResult
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 
@@ -131,10 +132,9 @@ class Parts:
         record = self.completed.get(name)
         if record is None or record.key != key:
             return False
-        try:
+        with suppress(OSError):
             return part.stat().st_size == record.bytes and sha256_of(part) == record.sha256
-        except OSError:
-            return False
+        return False
 
     def record(self, result: TaskResult, key: str, part: Path, *, frames: int) -> CompletedTask:
         """Records that a task succeeded; the earlier record stays if the part is the same. Raises StorageError if its
@@ -172,17 +172,11 @@ def group_name(first: int, end: int) -> str:
 
 def read_completed(folder: Path) -> dict[str, CompletedTask]:
     """The last record of each task; invalid lines are skipped."""
-    try:
-        lines = (folder / COMPLETED).read_text().splitlines()
-    except OSError:
-        return {}
     completed = {}
-    for line in lines:
-        try:
-            record = CompletedTask(**json.loads(line))
-        except (ValueError, TypeError):
-            continue
-        completed[record.name] = record
+    for values in json_lines(folder / COMPLETED):
+        with suppress(TypeError):
+            record = CompletedTask(**values)
+            completed[record.name] = record
     return completed
 
 
