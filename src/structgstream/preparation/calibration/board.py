@@ -159,9 +159,7 @@ def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[Indices, NDArray
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # of markers; chessboard corners always are
-    pixels: Any = None
-    corners: Any = None
-    ids: Any = None
+    pixels = corners = ids = None
     for marker_first in (False, True)[: 2 - board.rows % 2]:
         layout = board.opencv_board(marker_first=marker_first)
         detector = cv2.aruco.CharucoDetector(layout, cv2.aruco.CharucoParameters(), parameters)
@@ -191,8 +189,7 @@ def _check_markers(
         )
     if any(found.values()):
         return
-    other = _other_dictionary(pictures, board)
-    if other is not None:
+    if (other := _other_dictionary(pictures, board)) is not None:
         raise CalibrationError(
             f"The board was given as of {board.dictionary}, but the pictures show markers of {other}; give the "
             "board as printed on its page."
@@ -216,19 +213,15 @@ def _other_dictionary(pictures: Mapping[str, Sequence[NDArray[np.uint8]]], board
 def _check_layout(board: Board, found: Mapping[str, Sequence[Sighting]]) -> None:
     """Corners that do not lie as on the board: other numbers of squares, or another share of markers."""
     cv2 = opencv()
-    wrong = total = 0
-    flat = board.corners[:, :2]
-    for own_sightings in found.values():
-        for sighting in own_sightings:
-            if len(sighting.corners) < 8:
-                continue
-            total += 1
-            H, mask = cv2.findHomography(flat[sighting.corners], sighting.pixels, cv2.RANSAC, 8.0)
-            wrong += H is None or mask is None or float(np.mean(mask)) < WRONG_LAYOUT
-    if total and wrong > total / 2:
+    wrong, flat = 0, board.corners[:, :2]
+    judged = [sighting for own in found.values() for sighting in own if len(sighting.corners) >= 8]
+    for sighting in judged:
+        H, mask = cv2.findHomography(flat[sighting.corners], sighting.pixels, cv2.RANSAC, 8.0)
+        wrong += H is None or mask is None or float(np.mean(mask)) < WRONG_LAYOUT
+    if wrong > len(judged) / 2:
         raise CalibrationError(
-            f"The corners in {wrong} of {total} pictures do not lie as on a board of {board.text}; give the board's "
-            "real numbers of squares and markers, as printed on its page."
+            f"The corners in {wrong} of {len(judged)} pictures do not lie as on a board of {board.text}; give the "
+            "board's real numbers of squares and markers, as printed on its page."
         )
 
 
