@@ -159,7 +159,9 @@ def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[Indices, NDArray
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # of markers; chessboard corners always are
-    pixels = corners = ids = None
+    pixels: Any = None
+    corners: Any = None
+    ids: Any = None
     for marker_first in (False, True)[: 2 - board.rows % 2]:
         layout = board.opencv_board(marker_first=marker_first)
         detector = cv2.aruco.CharucoDetector(layout, cv2.aruco.CharucoParameters(), parameters)
