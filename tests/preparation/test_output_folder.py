@@ -14,6 +14,7 @@ from structgstream.preparation.output_folder import (
     FOLDER,
     SOURCE,
     Link,
+    Packing,
     Silent,
     Steps,
     Stored,
@@ -21,6 +22,7 @@ from structgstream.preparation.output_folder import (
     link,
     lock_output,
     mark_output,
+    plain,
     unlink,
 )
 from tests.support.killed import folders_of_the_killed
@@ -183,15 +185,11 @@ def run(steps: Steps, step: str, value: int, done: list[str], *, after: tuple[st
         done.append(step)
         return value
 
-    return steps.run(
-        step,
-        {"value": value},
-        compute,
-        pack=lambda found: Stored({"found": found}, {"row": np.arange(found)}),
-        unpack=lambda stored: stored.values["found"] if len(stored.arrays["row"]) == stored.values["found"] else -1,
-        summary=str,
-        after=after,
+    packing = Packing[int](
+        lambda found: Stored({"found": found}, {"row": np.arange(found)}),
+        lambda stored: stored.values["found"] if len(stored.arrays["row"]) == stored.values["found"] else -1,
     )
+    return steps.run(step, {"value": value}, compute, packing, summary=str, after=after)
 
 
 def test_a_step_is_done_once(tmp_path: Path) -> None:
@@ -281,15 +279,7 @@ def test_steps_are_reported_and_their_summaries_recorded(tmp_path: Path) -> None
     steps.begin("scale", skipped=True)
     steps.progress(1, 3, "cam00")
     steps.end("scale", "metres")
-    found = steps.run(
-        "count",
-        {},
-        lambda: 4,
-        pack=lambda value: Stored({"value": value}),
-        unpack=lambda stored: stored.values["value"],
-        summary={4: "four"}.__getitem__,
-    )
-    assert found == 4
+    assert steps.run("count", {}, lambda: 4, plain("value"), summary={4: "four"}.__getitem__) == 4
     assert heard.calls == [
         ("begin", "scale", True), ("progress", 1, 3, "cam00"), ("end", "scale", "metres"),
         ("begin", "count", False), ("end", "count", "four"),

@@ -21,9 +21,9 @@ from structgstream.evaluation.recording import capture_of
 from structgstream.preparation import prepare as preparation
 from structgstream.preparation import solvers
 from structgstream.preparation.calibration.solved import Observations, RovingFrames, SolvedCalibration
+from structgstream.preparation.footage import open_roving, sharpest_frames, write_png
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
-from structgstream.preparation.roving import open_roving, sharpest_frames, write_png
 from tests.support.captures import write_picture, write_video
 from tests.support.filmed import noise_texture
 from tests.support.planes import HEIGHT, WIDTH, room_frame, room_rig
@@ -47,7 +47,7 @@ def walk(folder: Path, *, frames: int = LENGTH, blurred: Sequence[int] = (), fps
 
 
 def test_the_sharpest_frames_of_equal_parts_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("structgstream.preparation.roving.FRAMES", 8)
+    monkeypatch.setattr("structgstream.preparation.footage.ROVING_FRAMES", 8)
     file = walk(tmp_path, blurred=[number for number in range(LENGTH) if number % 5 != 3])
     found = sharpest_frames(open_roving(file))
     assert list(found) == [f"roving/{number:06d}" for number in range(3, LENGTH, 5)]

@@ -16,7 +16,7 @@ seldom match wrongly, are looked at first, and no others where all of them agree
 """
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -73,9 +73,7 @@ def _flipped(viewmat: torch.Tensor) -> torch.Tensor:
 MISTAKES: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "inverted (camera to world in place of world to camera)": torch.linalg.inv,
     "in OpenGL axes in place of OpenCV's (y and z flipped)": _flipped,
-    "inverted and in OpenGL axes (camera to world in place of world to camera)": lambda viewmat: _flipped(
-        torch.linalg.inv(viewmat)
-    ),
+    "inverted and in OpenGL axes (camera to world in place of world to camera)": lambda pose: _flipped(pose.inverse()),
 }  # what undoes each
 
 
@@ -121,21 +119,18 @@ def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
     before = _shares(evidence, cameras, pairs)
     readings = {how: _shares(evidence, reading, pairs) for how, reading in readings_of(cameras).items()}
     best = min(readings, key=lambda how: readings[how])
-    names = tuple(cameras)
     if readings[best] < min(0.5, before / 2):
-        return Finding(
-            "error",
+        sentence = (
             f"The poses of all cameras look {best}: {before:.0%} of the matches between pictures violate them as "
-            f"they are, {readings[best]:.0%} once that is undone; write world-to-camera matrices with OpenCV axes.",
-            names,
+            f"they are, {readings[best]:.0%} once that is undone; write world-to-camera matrices with OpenCV axes."
         )
-    return Finding(
-        "error",
-        f"Poses and pictures do not belong together: {before:.0%} of the matches between pictures violate the poses "
-        "of most cameras; check that names, pictures and calibration are of one take and of one picture size, that "
-        "the cameras are in step, or calibrate again with structgstream prepare.",
-        names,
-    )
+    else:
+        sentence = (
+            f"Poses and pictures do not belong together: {before:.0%} of the matches between pictures violate the "
+            "poses of most cameras; check that names, pictures and calibration are of one take and of one picture "
+            "size, that the cameras are in step, or calibrate again with structgstream prepare."
+        )
+    return Finding("error", sentence, tuple(cameras))
 
 
 def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> tuple[list[Finding], list[str]]:
@@ -146,8 +141,6 @@ def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdi
     sizes = {name: (cameras[name].width, cameras[name].height) for name in off}
     usual = max(sizes.values(), key=[*sizes.values()].count)
     same = sorted((name for name in off if sizes[name] == usual), key=natural)
-    if len(same) < 2:
-        return [], list(off)
     from scipy.optimize import linear_sum_assignment
 
     costs = np.array(
@@ -203,8 +196,7 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdic
 
 def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
     """How far a camera is from the pose of its pictures, as far as they determine it."""
-    found = verdict.resections.get(name)
-    if found is not None:
+    if (found := verdict.resections.get(name)) is not None:
         sentence = (
             f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
             "pixels (median) from where its picture shows them"
@@ -220,13 +212,13 @@ def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict
 
 def _bad_pairs(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
     """Names, with errors in pixels, of the cameras whose matches a camera's pose does not explain."""
-    sentence = []
+    bad = []
     for pair in verdict.suspects.bad:
         if name in pair and not set(pair) & set(verdict.suspects.off) - {name}:
             (other,) = set(pair) - {name}
             error = pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
-            sentence.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
-    return ", ".join(sentence[:4]) + (f" and {len(sentence) - 4} more" if len(sentence) > 4 else "")
+            bad.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
+    return ", ".join(bad[:4]) + (f" and {len(bad) - 4} more" if len(bad) > 4 else "")
 
 
 def _share_with(
@@ -236,8 +228,7 @@ def _share_with(
 
     Of the points that a corrected camera explains; of its matches with good cameras where there is none.
     """
-    found = verdict.resections.get(name)
-    if found is not None:
+    if (found := verdict.resections.get(name)) is not None:
         return max(1 - explained(verdict.tracks, camera, name) / found.points, 0.0)
     good = set(cameras) - set(verdict.suspects.off)
     pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= good]
@@ -245,9 +236,13 @@ def _share_with(
 
 
 def _shares(evidence: Evidence, cameras: Mapping[str, Camera], pairs: Sequence[Pair]) -> float:
-    found = [pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair)) for pair in pairs]
-    total = sum(error.matches for error in found)
-    return sum(error.share * error.matches for error in found) / total if total else float("nan")
+    return _violating([pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair)) for pair in pairs])
+
+
+def _violating(errors: Collection[PairError]) -> float:
+    """Share of the matches of all pairs that violate the poses; NaN without any."""
+    total = sum(error.matches for error in errors)
+    return sum(error.share * error.matches for error in errors) / total if total else float("nan")
 
 
 MIN_MATCHES = 100  # of a rig, for a verdict
@@ -320,8 +315,6 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
 
 def _summed(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> PoseCheck:
     """The numbers of all pairs."""
-    total = sum(error.matches for error in errors.values())
-    violating = sum(error.matches * error.share for error in errors.values())
     matched = {name for pair in errors for name in pair}
     unmatched = tuple(name for name in cameras if name not in matched)
-    return PoseCheck(total, violating / total if total else float("nan"), unmatched)
+    return PoseCheck(sum(error.matches for error in errors.values()), _violating(errors.values()), unmatched)

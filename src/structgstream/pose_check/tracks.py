@@ -159,8 +159,7 @@ def _edges(
 
     Matches of cameras that are not off must agree with their poses.
     """
-    counts = [len(evidence.keypoints[name]) for name in names]
-    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
+    first = np.cumsum([0, *(len(evidence.keypoints[name]) for name in names)])
     start = dict(zip(names, first, strict=False))
     edges = [np.empty((0, 2), np.intp)]
     for pair in evidence.overlapping():

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import atomic_write
 from structgstream.data.camera_files import (
     NO_CAMERAS,
     UNREAD,
@@ -32,9 +33,17 @@ from structgstream.data.camera_files import (
     name_of,
     other_roots,
 )
-from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
+from structgstream.data.images import (
+    PICTURE_SUFFIXES,
+    check_one_series,
+    opencv,
+    picture_size,
+    read_picture,
+    reduced_picture,
+    significant_bits,
+)
 from structgstream.data.posed_capture import PICTURE_FPS, filmed_roots
-from structgstream.data.prepared import pictures_of
+from structgstream.data.prepared import ROVING, pictures_of
 from structgstream.data.sound import read_audio
 from structgstream.data.timeline import Clock, natural, picture_slots
 from structgstream.data.video import measured_fps, pictures_at
@@ -334,3 +343,74 @@ def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
 def spread_moments(first: float, last: float, count: int) -> list[float]:
     """Moments from the first to the last, both included; fewer when the take has no length."""
     return np.linspace(first, last, count).tolist() if last > first and count > 1 else [first]
+
+
+ROVING_FRAMES = 40  # most that are used of a camera that was walked through the set
+CANDIDATES = 5  # of which each one is the sharpest
+MIN_FRAMES, MIN_SECONDS = 8, 4.0
+SHARPNESS_SIDE = 640  # pixels, to which the longer side is reduced before sharpness is measured
+OR_PICTURES = "or a folder of pictures of one camera"
+
+
+def open_roving(path: Path) -> Footage:
+    """The one camera of a video, or of a folder of its pictures, that was walked through the set: any phone, whose
+    exposure, lens and time are its own.
+
+    Raises:
+        CaptureError: it is missing, cannot be read, or is too short.
+    """
+    if not path.exists():
+        raise CaptureError(f"The roving video {path} does not exist; give a video, {OR_PICTURES}.")
+    files = {ROVING: path}
+    if path.is_dir():
+        footage = Footage(path.parent, files, {}, {ROVING: pictures_of(path)})
+        if not footage.stills[ROVING]:
+            raise CaptureError(f"The folder {path} holds no pictures; give a video, {OR_PICTURES}.")
+    elif path.suffix.lower() in VIDEO_SUFFIXES:
+        footage = Footage(path.parent, files, scan_videos(files), {})
+    else:
+        raise CaptureError(f"{path} is no video; give one, {OR_PICTURES}.")
+    stamps = footage.stamps(ROVING)
+    seconds = float(np.ptp(stamps)) if footage.tracks and len(stamps) else MIN_SECONDS
+    if len(stamps) < MIN_FRAMES or seconds < MIN_SECONDS:
+        length = f"{len(stamps)} frames" + (f" of {seconds:.1f} s" if footage.tracks else "")
+        raise CaptureError(
+            f"The roving video {path} is too short ({length}); walk through the set for half a minute, at least "
+            f"{MIN_FRAMES} frames and {MIN_SECONDS:g} s."
+        )
+    return footage
+
+
+def sharpest_frames(footage: Footage) -> Mapping[str, Picture]:
+    """The frames ``[H, W, 3]`` of a roving camera that are used, the sharpest of each of equal parts, by name in their
+    order."""
+    count = len(footage.stamps(ROVING))
+    tried = np.unique(np.linspace(0, count - 1, min(count, ROVING_FRAMES * CANDIDATES)).round().astype(int))
+    part = np.arange(len(tried)) * min(ROVING_FRAMES, len(tried)) // len(tried)
+    best: dict[int, tuple[float, int, Picture]] = {}
+    for own, number, picture in zip(part.tolist(), tried.tolist(), footage.pictures(ROVING, tried), strict=True):
+        sharp = sharpness(picture)
+        if own not in best or sharp > best[own][0]:
+            best[own] = sharp, number, picture
+    return {f"{ROVING}/{number:06d}": picture for _, number, picture in best.values()}
+
+
+def sharpness(picture: Picture) -> float:
+    """Variance of the Laplacian of the picture ``[H, W, 3]`` in grey: larger where edges are sharper."""
+    cv2 = opencv()
+    grey = cv2.cvtColor(reduced_picture(picture, SHARPNESS_SIDE), cv2.COLOR_RGB2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def frames_named(footage: Footage, names: Mapping[str, object]) -> Iterator[tuple[str, Picture]]:
+    """The frames of these names with their names, read again one by one."""
+    numbers = sorted(int(name.removeprefix(f"{ROVING}/")) for name in names)
+    for number, picture in zip(numbers, footage.pictures(ROVING, numbers), strict=True):
+        yield f"{ROVING}/{number:06d}", picture
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Writes ``picture`` ``[H, W, 3]``, whole or not at all. Raises StorageError if it cannot be written."""
+    cv2 = opencv()
+    stored = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
+    atomic_write(path, bytes(stored), called="The picture", new_folder=True, sync=False)

@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,19 @@ class Stored:
 
     values: Mapping[str, Any] = field(default_factory=dict)
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Packing(Generic[Value]):
+    """How results of a kind are stored."""
+
+    pack: Callable[[Value], Stored]
+    unpack: Callable[[Stored], Value]  # the reverse
+
+
+def plain(name: str) -> Packing[Any]:
+    """One value that JSON can hold, under a name."""
+    return Packing(lambda value: Stored({name: value}), lambda stored: stored.values[name])
 
 
 class Listener(Protocol):
@@ -89,9 +102,8 @@ class Steps(Listener):
         step: str,
         inputs: Mapping[str, object],
         compute: Callable[[], Value],
+        packing: Packing[Value],
         *,
-        pack: Callable[[Value], Stored],
-        unpack: Callable[[Stored], Value],
         summary: Callable[[Value], str],
         after: tuple[str, ...] = (),
     ) -> Value:
@@ -99,7 +111,6 @@ class Steps(Listener):
 
         Args:
             inputs: what it depends on apart from other steps, as JSON can hold it.
-            pack: the result as numbers and arrays, of which ``unpack`` makes it.
             summary: the result in one line.
             after: steps whose results it uses.
 
@@ -113,10 +124,10 @@ class Steps(Listener):
         self.begin(step, skipped=stored is not None)
         if stored is not None:
             self.skipped.append(step)
-            value = unpack(stored)
+            value = packing.unpack(stored)
         else:
             value = compute()
-            self._write(step, key, pack(value))
+            self._write(step, key, packing.pack(value))
         self.end(step, summary(value))
         return value
 
@@ -152,11 +163,10 @@ def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
     each."""
     found = []
     for name, path in files.items():
-        inside = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-        for file in inside:
+        folder = path if path.is_dir() else path.parent
+        for file in sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]:
             status = file.stat()
-            inner = file.relative_to(path).as_posix() if path.is_dir() else file.name
-            found.append((name, inner, status.st_size, status.st_mtime_ns))
+            found.append((name, file.relative_to(folder).as_posix(), status.st_size, status.st_mtime_ns))
     return found
 
 

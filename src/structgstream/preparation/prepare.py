@@ -5,7 +5,7 @@
 """
 
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -45,11 +45,12 @@ from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
-from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.footage import Footage, find_footage, frames_named, open_roving, write_png
 from structgstream.preparation.options import METHODS, PrepareOptions
 from structgstream.preparation.output_folder import (
     FOLDER,
     Listener,
+    Packing,
     Silent,
     Steps,
     Stored,
@@ -57,12 +58,15 @@ from structgstream.preparation.output_folder import (
     link,
     lock_output,
     mark_output,
+    plain,
     remove_others,
     unlink,
 )
 from structgstream.preparation.report import PURPOSE, write_report
-from structgstream.preparation.roving import frames_named, open_roving, write_png
 from structgstream.preparation.solvers import (
+    CALIBRATION,
+    CLOCKS,
+    REFINED,
     Clocks,
     board_footage,
     calibration_key,
@@ -73,16 +77,12 @@ from structgstream.preparation.solvers import (
     find_timestamps,
     first_clocks,
     given_cameras,
-    packed,
-    packed_clocks,
     refined,
     require_calibration,
     solve_cameras,
     stated_focals,
     summary,
     synchronized,
-    unpacked,
-    unpacked_clocks,
 )
 from structgstream.preparation.sound import best_microphone, recording
 
@@ -154,7 +154,7 @@ class Job:
             "calibration": method if isinstance(method, str) else calibration_key(method),
             "board": self.options.board_videos is not None,
         }
-        return self._clocks("synchronize", inputs, find)
+        return self.steps.run("synchronize", inputs, find, CLOCKS, summary=lambda found: found.summary)
 
     def synchronize_again(
         self, footage: Footage, clocks: Clocks, method: str | Calibration, solved: SolvedCalibration
@@ -163,15 +163,7 @@ class Job:
         if clocks.method != "motion" or not isinstance(method, str):
             return clocks
         again = partial(synchronized, footage, self.options, cameras=solved.cameras)
-        return self._clocks("clocks", {}, again, after=("scale",))
-
-    def _clocks(
-        self, step: str, inputs: Mapping[str, object], find: Callable[[], Clocks], after: tuple[str, ...] = ()
-    ) -> Clocks:
-        return self.steps.run(
-            step, inputs, find, pack=packed_clocks, unpack=unpacked_clocks, summary=lambda found: found.summary,
-            after=after,
-        )  # fmt: skip
+        return self.steps.run("clocks", {}, again, CLOCKS, summary=lambda found: found.summary, after=("scale",))
 
     def calibrate(self, footage: Footage, clocks: Clocks, method: str | Calibration) -> SolvedCalibration:
         """Poses, intrinsics and lenses, refined and in a unit where that is asked for."""
@@ -200,18 +192,13 @@ class Job:
             return check_complete(found, footage)
 
         calibrated = self.steps.run(
-            "calibrate", inputs, solve, pack=packed, unpack=unpacked, after=("synchronize",),
+            "calibrate", inputs, solve, CALIBRATION, after=("synchronize",),
             summary=lambda found: f"{name}: {summary(found)}" + (f"; {detail}" if detail else ""),
         )  # fmt: skip
         if options.refine:
+            refine = partial(refined, calibrated, footage, clocks, options)
             calibrated, _ = self.steps.run(
-                "refine",
-                {},
-                partial(refined, calibrated, footage, clocks, options),
-                pack=lambda found: Stored({**packed(found[0]).values, "detail": found[1]}, packed(found[0]).arrays),
-                unpack=lambda stored: (unpacked(stored), str(stored.values["detail"])),
-                summary=lambda found: found[1],
-                after=("calibrate",),
+                "refine", {}, refine, REFINED, summary=lambda found: found[1], after=("calibrate",)
             )
 
         def scale() -> SolvedCalibration:
@@ -220,14 +207,10 @@ class Job:
             return with_distance(calibrated, distance.first, distance.second, metres=distance.metres)
 
         return self.steps.run(
-            "scale",
-            {"distance": None if distance is None else asdict(distance)},
-            scale,
-            pack=packed,
-            unpack=unpacked,
+            "scale", {"distance": None if distance is None else asdict(distance)}, scale, CALIBRATION,
             summary=lambda found: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
             after=("refine" if options.refine else "calibrate",),
-        )
+        )  # fmt: skip
 
     def link(self, footage: Footage, content: PreparedCapture) -> None:
         self.steps.begin("link")
@@ -261,13 +244,7 @@ class Job:
             if not all((self.capture / name).is_file() for name in names):
                 result.unlink(missing_ok=True)
             self.steps.run(
-                ROVING,
-                {},
-                write,
-                pack=lambda count: Stored({"count": count}),
-                unpack=lambda stored: int(stored.values["count"]),
-                summary=lambda count: f"{count} pictures",
-                after=("calibrate",),
+                ROVING, {}, write, plain("count"), summary=lambda count: f"{count} pictures", after=("calibrate",)
             )
         if (folder := self.capture / ROVING).is_dir():
             remove_others(folder, [Path(name).name for name in names])
@@ -295,8 +272,7 @@ class Job:
             "near",
             self._inputs(content),
             measure,
-            pack=lambda found: Stored({"nearest": found}),
-            unpack=lambda stored: stored.values["nearest"],
+            plain("nearest"),
             summary=lambda found: "too few points: 0.12 rig radii" if found is None
             else f"{NEAR_SHARE * found:.3g}, half of the depth of the nearest points",
             after=("synchronize",),
@@ -314,11 +290,10 @@ class Job:
             "points",
             self._inputs(content),
             estimate,
-            pack=lambda points: Stored({}, {"points": points}),
-            unpack=lambda stored: stored.arrays["points"],
+            Packing(lambda points: Stored({}, {"points": points}), lambda stored: stored.arrays["points"]),
             summary=lambda points: f"{len(points):,} points of frame 0",
             after=("synchronize",),
-        )  # fmt: skip
+        )
         with atomic_file(self.capture / POINTS) as file:
             np.save(file, found)
         content = replace(content, points=POINTS)
@@ -333,8 +308,7 @@ class Job:
             "sound",
             {"files": fingerprint(footage.files)},
             lambda: best_microphone((name, recording(footage.files[name])) for name in footage.cameras),
-            pack=lambda camera: Stored({"camera": camera}),
-            unpack=lambda stored: stored.values["camera"],
+            plain("camera"),
             summary=lambda camera: "no camera has any" if camera is None else f"the microphone of {camera} is the best",
         )
         if found is not None:
@@ -357,10 +331,11 @@ class Job:
             "check",
             self._inputs(content),
             look,
-            pack=lambda findings: Stored({"findings": [asdict(finding) for finding in findings]}),
-            unpack=lambda stored: tuple(
-                Finding(found["severity"], found["sentence"], tuple(found["cameras"]))
-                for found in stored.values["findings"]
+            Packing(
+                lambda findings: Stored({"findings": [asdict(finding) for finding in findings]}),
+                lambda stored: tuple(
+                    Finding(**{**found, "cameras": tuple(found["cameras"])}) for found in stored.values["findings"]
+                ),
             ),
             summary=lambda findings: f"{len(findings)} finding{'s' * (len(findings) != 1)}; {REPORT}/index.html",
             after=("points",),

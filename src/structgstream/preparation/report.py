@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -62,9 +62,7 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: 
             axis.text(
                 column, row, " ".join(label), ha="center", va="center", fontsize=7, color="white" if dark else INK
             )
-    bar = figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02, extend="max")
-    bar.set_label("median distance to epipolar lines, pixels", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+    _add_bar(figure, shown, "median distance to epipolar lines, pixels", ax=axis, shrink=0.7, pad=0.02, extend="max")
     crosses = "\nx: both cameras fit others, so most likely these are wrong matches" if crossed else ""
     axis.set_title(f"Error of each pair; white: no matches{crosses}", fontsize=10, loc="left", color=INK)
     save_figure(figure, path)
@@ -110,11 +108,16 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
         without_frame(axis)
         axis.grid(axis="both", color=FAINT, linewidth=0.8)
     if shown is not None:
-        bar = figure.colorbar(shown, ax=figure.axes, shrink=0.8, pad=0.01)
-        bar.set_label("cameras whose picture holds the point", fontsize=8)
-        bar.ax.tick_params(labelsize=8)
+        _add_bar(figure, shown, "cameras whose picture holds the point", ax=figure.axes, shrink=0.8, pad=0.01)
     figure.suptitle(f"Rig and points (near plane at {near:.3g} {label})", fontsize=10, color=INK)
     save_figure(figure, path)
+
+
+def _add_bar(figure: "Figure", shown: Any, label: str, **options: Any) -> None:
+    """A bar of the colours that are shown, with its label."""
+    bar = figure.colorbar(shown, **options)
+    bar.set_label(label, fontsize=8, color=INK)
+    bar.ax.tick_params(labelsize=8)
 
 
 def draw_colors(path: Path, report: CheckReport) -> None:
@@ -241,18 +244,13 @@ def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: s
             *tracks.pixels[order].T, c=np.minimum(tracks.residuals[order], limit), cmap="plasma", vmin=0, vmax=limit,
             s=16, edgecolors="white", linewidths=0.4,
         )  # fmt: skip
-        bar = figure.colorbar(shown, ax=axis, shrink=0.8, pad=0.01, aspect=30, extend="max")
-        bar.set_label("reprojection error, pixels", fontsize=8, color=INK)
-        bar.ax.tick_params(labelsize=8)
+        options = {"ax": axis, "shrink": 0.8, "pad": 0.01, "aspect": 30, "extend": "max"}
+        _add_bar(figure, shown, "reprojection error, pixels", **options)
     found = report.cameras[name]
     median = "none" if found.reprojection_pixels is None else f"{found.reprojection_pixels:.2f} px"
     off = " - OFF" if name in examined.suspects.off else ""
-    axis.set_title(
-        f"{name}{off}: median error {median}, {found.points} points, matches with {found.overlaps} cameras",
-        fontsize=10,
-        color=COLORS[3] if off else INK,
-        loc="left",
-    )
+    title = f"{name}{off}: median error {median}, {found.points} points, matches with {found.overlaps} cameras"
+    axis.set_title(title, fontsize=10, color=COLORS[3] if off else INK, loc="left")
     save_figure(figure, path)
 
 

@@ -32,13 +32,13 @@ from structgstream.preparation.footage import (
     Shots,
     find_footage,
     shared_seconds,
+    sharpest_frames,
     shots_of,
     spread_moments,
     still_pictures,
 )
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.output_folder import Stored
-from structgstream.preparation.roving import sharpest_frames
+from structgstream.preparation.output_folder import Packing, Stored
 from structgstream.preparation.synchronization.synchronize import Method, synchronize
 
 TIMESTAMPS = "timestamps.csv"
@@ -98,15 +98,12 @@ def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
         return Clocks({name: Clock() for name in footage.cameras}, "motion", summary, sure=False)
 
 
-def packed_clocks(found: Clocks) -> Stored:
-    """The clocks as plain values."""
-    return Stored(asdict(found))
-
-
-def unpacked_clocks(stored: Stored) -> Clocks:
-    """The reverse of :func:`packed_clocks`."""
+def _unpacked_clocks(stored: Stored) -> Clocks:
     clocks = {name: Clock(**clock) for name, clock in stored.values["clocks"].items()}
     return Clocks(**{**stored.values, "clocks": clocks})
+
+
+CLOCKS = Packing(lambda found: Stored(asdict(found)), _unpacked_clocks)
 
 
 BOARD_SECONDS = 0.4
@@ -188,8 +185,7 @@ def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
 
 def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibration:
     """The calibration itself; a ``CalibrationError`` where cameras could not be placed."""
-    missing = [name for name in footage.cameras if name not in solved.cameras]
-    if missing:
+    if missing := [name for name in footage.cameras if name not in solved.cameras]:
         raise CalibrationError(
             f"{listed(missing)} of {footage.where} could not be placed among the other {len(solved.cameras)}: their "
             "pictures have too little in common; move them closer to the others or show a board to all (structgstream "
@@ -262,6 +258,13 @@ def unpacked(stored: Stored) -> SolvedCalibration:
     return SolvedCalibration(cameras, stored.arrays["points"], Observations(**seen), missing, metres, roving)
 
 
+CALIBRATION = Packing(packed, unpacked)
+REFINED = Packing[tuple[SolvedCalibration, str]](
+    lambda found: Stored({**packed(found[0]).values, "detail": found[1]}, packed(found[0]).arrays),
+    lambda stored: (unpacked(stored), str(stored.values["detail"])),
+)
+
+
 def _cameras(entries: Mapping[str, Any]) -> dict[str, LensCamera]:
     cameras = {}
     for name, entry in entries.items():
@@ -274,16 +277,9 @@ def _cameras(entries: Mapping[str, Any]) -> dict[str, LensCamera]:
 def find_calibration(where: Path) -> Calibration | None:
     """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known."""
     folder, file = (where, None) if where.is_dir() else (where.parent, where)
-
-    def meant(name: str) -> bool:
-        return (folder / name).is_file() and file in (None, folder / name)
-
-    if meant(PREPARED):
-        return _of_prepared(folder)
-    if meant(CAMERAS_FILE):
-        return _of_cameras(folder / CAMERAS_FILE)
-    if meant(MODELS_FILE):
-        return read_models(folder / MODELS_FILE)
+    for name, read in ((PREPARED, _of_prepared), (CAMERAS_FILE, _of_cameras), (MODELS_FILE, read_models)):
+        if (folder / name).is_file() and file in (None, folder / name):
+            return read(folder / name)
     if (found := read_calibration(folder, file)) is not None or file is not None:
         return found
     below = calibration_below(folder)
@@ -303,23 +299,21 @@ def require_calibration(where: Path) -> Calibration:
     return found
 
 
-def _of_prepared(folder: Path) -> Calibration:
-    capture = read_prepared(folder)
-    cameras = []
-    for name, camera in capture.cameras.items():
-        filmed = camera.filmed.camera
-        size = (filmed.width, filmed.height)
-        cameras.append(PosedCamera(name, filmed.viewmat.numpy(), filmed.K.numpy(), size, camera.filmed.lens))
-    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out), turned_by_exif=False)
+def _of_prepared(file: Path) -> Calibration:
+    capture = read_prepared(file.parent)
+    cameras = tuple(_posed(name, camera.filmed) for name, camera in capture.cameras.items())
+    return Calibration(file, cameras, held_out=sorted(capture.held_out), turned_by_exif=False)
 
 
 def _of_cameras(file: Path) -> Calibration:
     rig, _, _ = read_cameras(file)
-    cameras = tuple(
-        PosedCamera(name, camera.viewmat.numpy(), camera.K.numpy(), (camera.width, camera.height), Pinhole())
-        for name, camera in rig.cameras.items()
-    )
+    cameras = tuple(_posed(name, LensCamera(camera, Pinhole())) for name, camera in rig.cameras.items())
     return Calibration(file, cameras, held_out=rig.testing)
+
+
+def _posed(name: str, filmed: LensCamera) -> PosedCamera:
+    own = filmed.camera
+    return PosedCamera(name, own.viewmat.numpy(), own.K.numpy(), (own.width, own.height), filmed.lens)
 
 
 def given_cameras(calibration: Calibration, footage: Footage) -> SolvedCalibration:

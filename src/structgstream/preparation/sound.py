@@ -2,7 +2,7 @@
 """Which sound a stream gets: a camera's, in step by that camera's clock, or a file's, in step by what both hear."""
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -187,9 +187,8 @@ FILE = " file"
 
 def _clock_of(lag: PairLag, camera: Clock) -> Clock:
     """The clock of a file from what it shares with a camera."""
-    instants: Mapping[float, float] = dict(lag.instants)
-    own = np.array([at + apart for at, apart in instants.items()])
-    common = camera.common_seconds(np.array([*instants]))
+    at, apart = np.array(lag.instants).T
+    own, common = at + apart, camera.common_seconds(at)
     rate = 1.0
     if np.ptp(own) > DRIFT_SECONDS:
         rate = float(np.polyfit(own - own.mean(), common - common.mean(), 1)[0])

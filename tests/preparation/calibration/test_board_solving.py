@@ -60,7 +60,7 @@ def solved(model: LensModel) -> SolvedCalibration:
 
 @pytest.mark.parametrize("model", ["brown", "fisheye"])
 def test_a_rig_is_found_in_metres(model: LensModel) -> None:
-    """Of pinholes, with videos: test_prepare_paths.py."""
+    """Of pinholes, with videos: test_prepare.py."""
     rig, found = filmed(model)[0], solved(model)
     assert list(found.cameras) == list(rig)
     assert found.metres

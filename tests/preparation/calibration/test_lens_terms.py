@@ -5,7 +5,16 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.preparation.calibration.lens_terms import TERMS, derivatives, projected, row_of, with_row
+from structgstream.preparation.calibration.lens_terms import (
+    ACROSS,
+    FOCAL,
+    TERMS,
+    derivatives,
+    projected,
+    row_of,
+    usual_prior,
+    with_row,
+)
 
 LENSES: tuple[Lens, ...] = (
     Pinhole(),
@@ -57,3 +66,43 @@ def test_a_point_on_the_axis_of_a_fisheye_has_derivatives() -> None:
     )
     assert np.isfinite(by_point).all()
     assert np.isfinite(by_row).all()
+
+
+FREE = (FOCAL, ACROSS)
+COUNT = 40
+
+
+def lens_rows(mean: float, differences: float) -> np.ndarray:
+    found = np.zeros((COUNT, TERMS))
+    found[:, ACROSS] = mean + differences * np.random.default_rng(0).normal(size=COUNT)
+    return found
+
+
+def test_an_offset_that_all_share_costs_less_than_as_large_ones_of_their_own() -> None:
+    prior = usual_prior(np.zeros(COUNT, np.intp), FREE, fisheye=False)
+    alike, each = np.zeros((COUNT, TERMS)), np.zeros((COUNT, TERMS))
+    alike[:, ACROSS] = 0.01
+    each[:, ACROSS] = 0.01 * (-1.0) ** np.arange(COUNT)
+    assert prior.cost(alike) < 0.01 * prior.cost(each)
+
+
+def test_how_far_lenses_differ_is_estimated() -> None:
+    prior = usual_prior(np.zeros(COUNT, np.intp), FREE, fisheye=False)
+    for differences in (0.001, 0.02):
+        found, own = prior, lens_rows(0.01, differences)
+        for _ in range(20):
+            found = found.updated(own, np.zeros((2 * COUNT, 2 * COUNT)), start=0, free=FREE)
+        usual = 0.002  # and counts as two lenses
+        expected = np.sqrt((2 * usual**2 + COUNT * differences**2) / (2 + COUNT))
+        assert found.differences[0, 0] == pytest.approx(expected, rel=0.25)
+
+
+def test_the_cost_has_the_gradient_and_the_curvature_that_are_added() -> None:
+    prior = usual_prior(np.array([0, 0, 1, 1] * 10), FREE, fisheye=False)
+    own, size = lens_rows(0.01, 0.004), 2 * COUNT
+    A, gradient = np.zeros((size, size)), np.zeros(size)
+    prior.add(A, gradient, own, start=0, free=FREE)
+    step = np.zeros((COUNT, TERMS))
+    step[:, ACROSS] = np.random.default_rng(1).normal(size=COUNT) * 1e-3
+    flat = step[:, list(FREE)].ravel()
+    assert prior.cost(own + step) - prior.cost(own) == pytest.approx(gradient @ flat + flat @ A @ flat / 2)

@@ -54,7 +54,7 @@ def test_principal_points_that_all_cameras_have_off_the_middle_are_found(monkeyp
     rig, pictures = filmed_room()
     cut = {name: [np.ascontiguousarray(shots[0][:-6, :-8])] for name, shots in pictures.items()}
     found = {}
-    for name, own in all_keypoints(pictures, workers=1).items():
+    for name, own in all_keypoints(pictures).items():
         left = (own.pixels < (312, 234)).all(1)
         found[name] = Keypoints(own.pixels[left], own.descriptors[left], own.seen[left])
     monkeypatch.setattr(structure, "all_keypoints", lambda pictures, **options: found)
@@ -127,7 +127,7 @@ def test_the_start_that_places_most_cameras_wins(monkeypatch: pytest.MonkeyPatch
 
     def finished(best: SimpleNamespace, *arguments: Any, **options: Any) -> SimpleNamespace:
         taken.append(best)
-        return SimpleNamespace(missing=())
+        return SimpleNamespace(missing=(), roving=None)
 
     monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"pinhole": (40.0, 60.0, 80.0)})
     monkeypatch.setattr(structure, "all_keypoints", lambda *arguments, **options: {})

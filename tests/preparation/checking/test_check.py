@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mistakes made in a rig whose truth is known, and what the check says of each."""
+"""Mistakes made in a rig whose truth is known, what the check says of each, and the check of a folder."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
+from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import Finding, explain
 from structgstream.pose_check.tracks import gather
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, CheckReport, check_capture
+from structgstream.preparation.prepare import check_folder
 from tests.support.evidence_made import Cameras, farther, turned
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import room_frame, room_rig
+from tests.support.quick_preparation import Heard
+from tests.support.rooms import write_room
 
 
 @cache
@@ -192,3 +197,31 @@ def test_a_few_wrong_matches_are_a_note() -> None:
     (note,) = explain(evidence, rig.cameras, verdict)
     assert (note.severity, note.cameras) == ("note", ("cam02",))
     assert "could not be checked: its few matches, with 'cam03' (25, off by" in note.sentence
+
+
+def test_a_folder_of_any_layout_is_checked_and_reported(tmp_path: Path) -> None:
+    write_room(tmp_path / "room")
+    heard = Heard()
+    checked = check_folder(tmp_path / "room", report=tmp_path / "report", listener=heard)
+    assert (tmp_path / "report" / "index.html").is_file()
+    assert heard.calls[0] == ("begin", "check", False)
+    assert heard.calls[-1] == ("end", "check", f"{len(checked.report.findings)} findings")
+    before = sorted(tmp_path.rglob("*"))
+    again = check_folder(tmp_path / "room", report=None)
+    assert again.report.findings == checked.report.findings
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_report_that_cannot_be_written_is_noticed_first(tmp_path: Path) -> None:
+    write_room(tmp_path / "room")
+    (tmp_path / "file").write_text("")
+    heard = Heard()
+    with pytest.raises(StorageError, match="report of a check"):
+        check_folder(tmp_path / "room", report=tmp_path / "file" / "report", listener=heard)
+    assert heard.calls == [("begin", "check", False)]
+
+
+def test_what_is_no_capture(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError):
+        check_folder(tmp_path, report=tmp_path / "report")
+    assert not (tmp_path / "report").exists()

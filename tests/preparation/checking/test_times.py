@@ -38,22 +38,20 @@ def test_how_late_is_how_bad(late: float, severity: str | None, said: str) -> No
     assert all(said in finding.sentence and finding.cameras == ("b",) for finding in findings)
 
 
-def test_less_than_chance_is_nothing() -> None:
-    assert time_findings(measured(off=("b",), sigma=0.01, a=0.0, b=0.029)) == []
-    assert len(time_findings(measured(off=("b",), sigma=0.01, a=0.0, b=0.031))) == 1
-
-
-def test_a_little_is_reported_those_that_are_off_alone() -> None:
-    assert time_findings(measured(a=0.0, b=0.007)) == []
-    assert len(time_findings(measured(a=0.0, b=0.1))) == 1
-
-
-def test_what_may_be_less_than_half_a_frame_is_no_error() -> None:
-    """26.4 ms (5.1 ms): another choice of frames would mend it or make it worse."""
-    (finding,) = time_findings(measured(off=("b",), sigma=0.0051, a=0.0, b=0.0264))
-    assert finding.severity == "warning"
-    (finding,) = time_findings(measured(off=("b",), sigma=0.0045, a=0.0, b=0.0264))
-    assert finding.severity == "error"
+@pytest.mark.parametrize(
+    ("off", "sigma", "late", "severities"),
+    [
+        (("b",), 0.01, 0.029, []),  # less than chance
+        (("b",), 0.01, 0.031, ["warning"]),
+        ((), 1e-4, 0.007, []),  # a little is reported of those that are off alone
+        ((), 1e-4, 0.1, ["error"]),
+        (("b",), 0.0051, 0.0264, ["warning"]),  # maybe less than half a frame: other frames would mend it or harm
+        (("b",), 0.0045, 0.0264, ["error"]),
+    ],
+)
+def test_chance_and_what_is_off_decide(off: tuple[str, ...], sigma: float, late: float, severities: list[str]) -> None:
+    findings = time_findings(measured(off=off, sigma=sigma, a=0.0, b=late))
+    assert [finding.severity for finding in findings] == severities
 
 
 def test_pictures_between_those_of_the_others_are_one_warning() -> None:

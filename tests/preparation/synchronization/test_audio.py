@@ -1,20 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of made sound: echoes, gains, noise, drift."""
+"""Lags of made sound: echoes, gains, noise, drift; phases of windows, and loops that close."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.synchronization.audio import (
+    GRID_HERTZ,
+    OTHER_SECONDS,
+    REACH_SECONDS,
     PairLag,
     Sound,
+    Window,
+    ambiguity_seconds,
+    ambiguity_weights,
     audio_lags,
     connected_by,
+    phase_window,
     solve_by_audio,
     sound_of,
 )
 from structgstream.preparation.synchronization.solving import Solution
+from tests.support.properties import examples
 from tests.support.takes import heard
 
 CLOCKS = {"a": Clock(0.0), "b": Clock(1.2345), "c": Clock(0.6)}
@@ -136,3 +147,120 @@ def test_a_room_that_is_louder_than_the_direct_sound_is_uncertain() -> None:
         scores += list((errors - errors.mean()) / np.array(list(solution.sigmas.values())))
     assert len(scores) >= 6
     assert np.abs(scores).max() < 3
+
+
+BEGAN = {"a": 0.0, "b": 1.2, "c": -0.4, "d": 2.5}
+
+
+def lag_of(first: str, second: str, *, off: float = 0.0, rate: float = 0.0, fine: bool = True) -> PairLag:
+    apart = BEGAN[first] - BEGAN[second] + off
+    instants = tuple((at, apart + rate * at) for at in (2.0, 5.0, 9.0))
+    return PairLag(first, second, instants, 1e-4, 2e-3, 1.0, fine)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_loop_that_closes_leaves_less(turned: bool) -> None:
+    last = lag_of("c", "a") if turned else lag_of("a", "c")
+    lags = [lag_of("a", "b"), lag_of("b", "c"), last, lag_of("c", "d")]
+    assert ambiguity_weights(lags) == pytest.approx([1 / 3, 1 / 3, 1 / 3, 1])
+
+
+def test_a_loop_that_does_not_close_leaves_all_doubt() -> None:
+    assert ambiguity_weights([lag_of("a", "b"), lag_of("b", "c"), lag_of("a", "c", off=2e-3)]) == [1, 1, 1]
+    assert ambiguity_weights([lag_of("a", "b"), lag_of("b", "c"), lag_of("a", "c", fine=False)]) == [1, 1, 1]
+
+
+def test_loops_that_share_a_pair_support_each_other() -> None:
+    pairs = [lag_of("a", "b"), lag_of("b", "c"), lag_of("a", "c"), lag_of("b", "d"), lag_of("c", "d")]
+    assert ambiguity_weights(pairs) == pytest.approx([1 / 9] * 5)
+
+
+def test_drift_does_not_open_a_loop() -> None:
+    """Lags of c change by 1e-4 a second: 0.25 ms in the time by which clocks differ, 0.9 ms in the take."""
+    lags = [lag_of("a", "b"), lag_of("b", "c", rate=1e-4), lag_of("a", "c", rate=1e-4)]
+    assert ambiguity_weights(lags) == pytest.approx([1 / 3] * 3)
+
+
+LONG = 6.0
+REACH = round(REACH_SECONDS * GRID_HERTZ)
+
+
+def noise(seed: int = 0, seconds: float = LONG) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=round(seconds * SAMPLE_RATE)).astype(np.float32)
+
+
+def delayed(lag: float, *, gain: float = 1.0, snr: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+    """A sound, and the same one later by ``lag`` seconds with noise of its own, at another gain."""
+    sound = noise()
+    times = np.arange(len(sound)) / SAMPLE_RATE
+    late = np.interp(times - lag, times, sound)
+    late += np.random.default_rng(9).normal(size=len(times)) / snr
+    return sound, (gain * late).astype(np.float32)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.0031, -0.5, 1.2345678])
+def test_the_lag_is_found_within_a_part_of_a_sample(lag: float) -> None:
+    found = phase_window(*delayed(lag, gain=0.02), 3.0, lag + 0.002)
+    assert found is not None
+    assert found.seconds == pytest.approx(lag, abs=3e-6)
+    assert found.middle == 3.0
+
+
+def test_the_expectation_does_not_move_the_answer() -> None:
+    answers = [phase_window(*delayed(0.25), 3.0, 0.25 + off) for off in (-0.006, -0.001, 0.0, 0.004)]
+    assert np.ptp([one.seconds for one in answers if one is not None]) < 2e-6
+    assert None not in answers
+
+
+def test_beyond_its_reach_nothing_stands_out() -> None:
+    assert phase_window(*delayed(0.25), 3.0, 0.25 + 2 * REACH_SECONDS) is None
+    one, _ = delayed(0.0)
+    assert phase_window(one, noise(5), 3.0, 0.0) is None
+
+
+def test_silence_and_the_ends_of_a_recording_tell_nothing() -> None:
+    one, other = delayed(0.0)
+    assert phase_window(one, np.zeros_like(other), 3.0, 0.0) is None
+    assert phase_window(one, other, 3.0, 0.0) is not None
+    assert phase_window(one, other, 0.5, 0.0) is not None  # three quarters of the window are there
+    for middle in (-0.3, LONG + 0.3, 50.0):
+        assert phase_window(one, other, middle, 0.0) is None
+
+
+def test_the_curve_has_its_peak_in_the_middle() -> None:
+    found = phase_window(*delayed(0.25), 3.0, 0.253)
+    assert found is not None
+    assert len(found.curve) == 2 * REACH + 1
+    assert abs(int(found.curve.argmax()) - REACH) <= 1
+
+
+def curve(*peaks: tuple[float, float]) -> np.ndarray:
+    """Narrow peaks of a height at a distance in seconds from the middle."""
+    found = np.zeros(2 * REACH + 1)
+    for seconds, height in peaks:
+        found[REACH + round(seconds * GRID_HERTZ)] = height
+    return found
+
+
+@pytest.mark.parametrize(
+    ("others", "expected"),
+    [
+        ([], 0.0),
+        ([(0.8 * OTHER_SECONDS, 19.0)], 0.0),
+        ([(0.004, 20.0)], 0.004 / np.sqrt(2)),
+        ([(0.004, 10.0)], 0.004 * np.sqrt(1 / 65)),
+    ],
+)
+def test_one_peak_is_sure_and_an_equal_one_as_likely(others: list[tuple[float, float]], expected: float) -> None:
+    found = ambiguity_seconds([Window(0.0, 0.0, curve((0.0, 20.0), *others))])
+    assert found == pytest.approx(expected, rel=1e-6, abs=0)
+
+
+@given(st.lists(st.tuples(st.floats(-0.0075, 0.0075), st.floats(0.0, 20.0)), max_size=5))
+@examples(100)
+def test_the_uncertainty_is_within_reach_and_windows_that_differ_lower_it(others: list[tuple[float, float]]) -> None:
+    one = Window(0.0, 0.0, curve(*others, (0.0, 20.0)))
+    alone = ambiguity_seconds([one])
+    assert 0.0 <= alone <= REACH_SECONDS
+    assert ambiguity_seconds([one, Window(1.0, 0.0, curve((0.0, 20.0)))]) <= alone + 1e-12
+    assert ambiguity_seconds([one, one]) == pytest.approx(alone)

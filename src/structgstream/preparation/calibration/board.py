@@ -191,8 +191,7 @@ def _check_markers(
         )
     if any(found.values()):
         return
-    other = _other_dictionary(pictures, board)
-    if other is not None:
+    if (other := _other_dictionary(pictures, board)) is not None:
         raise CalibrationError(
             f"The board was given as of {board.dictionary}, but the pictures show markers of {other}; give the "
             "board as printed on its page."
@@ -216,19 +215,15 @@ def _other_dictionary(pictures: Mapping[str, Sequence[NDArray[np.uint8]]], board
 def _check_layout(board: Board, found: Mapping[str, Sequence[Sighting]]) -> None:
     """Corners that do not lie as on the board: other numbers of squares, or another share of markers."""
     cv2 = opencv()
-    wrong = total = 0
-    flat = board.corners[:, :2]
-    for own_sightings in found.values():
-        for sighting in own_sightings:
-            if len(sighting.corners) < 8:
-                continue
-            total += 1
-            H, mask = cv2.findHomography(flat[sighting.corners], sighting.pixels, cv2.RANSAC, 8.0)
-            wrong += H is None or mask is None or float(np.mean(mask)) < WRONG_LAYOUT
-    if total and wrong > total / 2:
+    wrong, flat = 0, board.corners[:, :2]
+    judged = [sighting for own in found.values() for sighting in own if len(sighting.corners) >= 8]
+    for sighting in judged:
+        H, mask = cv2.findHomography(flat[sighting.corners], sighting.pixels, cv2.RANSAC, 8.0)
+        wrong += H is None or mask is None or float(np.mean(mask)) < WRONG_LAYOUT
+    if wrong > len(judged) / 2:
         raise CalibrationError(
-            f"The corners in {wrong} of {total} pictures do not lie as on a board of {board.text}; give the board's "
-            "real numbers of squares and markers, as printed on its page."
+            f"The corners in {wrong} of {len(judged)} pictures do not lie as on a board of {board.text}; give the "
+            "board's real numbers of squares and markers, as printed on its page."
         )
 
 

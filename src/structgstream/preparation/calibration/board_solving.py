@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.data.calibration import listed
+from structgstream.data.calibration import listed, rigid
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.geometry import Floats
@@ -30,8 +30,6 @@ from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DIS
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 Sightings = Mapping[str, Sequence[Sighting]]
-
-
 FIELDS_OF_VIEW, FISHEYE_FIELDS_OF_VIEW = (30.0, 50.0, 70.0, 90.0), (60.0, 90.0, 120.0, 150.0, 175.0)
 MAX_SIGHTINGS_ALONE = 24
 POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
@@ -90,10 +88,8 @@ def _own_view(
     name: str, own_sightings: Sequence[Sighting], board: Board, size: tuple[int, int], lens: LensModel
 ) -> _View:
     """Intrinsics from the field of view that fits best, and a pose for each sighting that agrees with them."""
-    chosen = sorted(own_sightings, key=lambda sighting: (-len(sighting.corners), sighting.instant))[
-        : 2 * MAX_SIGHTINGS_ALONE
-    ]
-    chosen = sorted(chosen, key=lambda sighting: sighting.instant)
+    fullest = sorted(own_sightings, key=lambda sighting: (-len(sighting.corners), sighting.instant))
+    chosen = sorted(fullest[: 2 * MAX_SIGHTINGS_ALONE], key=lambda sighting: sighting.instant)
     picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
     best: tuple[float, LensCamera] | None = None
@@ -132,20 +128,20 @@ def _poses(
             sighting.pixels, board.corners[sighting.corners], camera, options
         )
         if result is not None and result["num_inliers"] >= 0.7 * len(sighting.corners):
-            found[sighting.instant] = np.vstack([np.array(result["cam_from_world"].matrix()), [0.0, 0.0, 0.0, 1.0]])
+            pose = result["cam_from_world"].matrix()
+            found[sighting.instant] = rigid(pose[:, :3], pose[:, 3])
     return found
 
 
 def _misfit(filmed: LensCamera, own_sightings: Sequence[Sighting], board: Board) -> float:
     """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
-    errors = []
     poses = _poses(filmed, own_sightings, board)
+    errors = [np.inf] * (len(own_sightings) - len(poses))
     for sighting in own_sightings:
-        if (pose := poses.get(sighting.instant)) is None:
-            errors.append(np.inf)
-            continue
-        found = filmed.pixels(board.corners[sighting.corners] @ pose[:3, :3].T + pose[:3, 3])
-        errors.append(float(np.median(np.nan_to_num(np.linalg.norm(found - sighting.pixels, axis=1), nan=np.inf))))
+        if (pose := poses.get(sighting.instant)) is not None:
+            found = filmed.pixels(board.corners[sighting.corners] @ pose[:3, :3].T + pose[:3, 3])
+            off = np.linalg.norm(found - sighting.pixels, axis=1)
+            errors.append(float(np.median(np.nan_to_num(off, nan=np.inf))))
     return float(np.median(errors))
 
 
@@ -262,8 +258,7 @@ def adjust_board(
     )
     parameters = solved(bundle, parameters, max_steps=ROUGH_STEPS) if rough else estimated(bundle, parameters)[1]
     parameters = _from_first(parameters)
-    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-    matrices[:, :3, :3], matrices[:, :3, 3] = parameters.body_rotations, parameters.body_positions
+    matrices = map(rigid, parameters.body_rotations, parameters.body_positions)
     return cameras_in(parameters, cameras, bundle.lens), dict(zip(poses, matrices, strict=True))
 
 

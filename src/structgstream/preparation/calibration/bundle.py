@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import rigid, rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera
 from structgstream.geometry import Floats, Indices, cross_matrices
 from structgstream.preparation.calibration.lens_terms import (
@@ -73,7 +73,7 @@ class Bundle:
 
     def residuals(self, parameters: Parameters) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
-        own, local = self.observations.camera, self._local(parameters)
+        own, (_, _, local) = self.observations.camera, self.in_cameras(parameters)
         ahead = local[:, 2] > 0
         safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
         found = projected(safe, parameters.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
@@ -87,13 +87,14 @@ class Bundle:
         loss = np.where(off <= HUBER, off**2 / 2, HUBER * off - HUBER**2 / 2)
         return float(loss.sum()) + self.prior.cost(parameters.rows)
 
-    def _local(self, parameters: Parameters) -> Floats:
+    def in_cameras(self, parameters: Parameters) -> tuple[Floats, Floats, Floats]:
+        """What was observed ``[M, 3]``: in the axes of the world from the body's origin, in those of its camera from
+        the world's origin, and from the camera's."""
         seen = self.observations
-        world = (
-            np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
-            + parameters.body_positions[seen.body]
-        )
-        return np.einsum("mab,mb->ma", parameters.rotations[seen.camera], world) + parameters.translations[seen.camera]
+        on_body = np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
+        world = on_body + parameters.body_positions[seen.body]
+        turned = np.einsum("mab,mb->ma", parameters.rotations[seen.camera], world)
+        return on_body, turned, turned + parameters.translations[seen.camera]
 
 
 def solved(bundle: Bundle, parameters: Parameters, *, max_steps: int = MAX_STEPS) -> Parameters:
@@ -155,6 +156,8 @@ class System:
 
 def linearized(bundle: Bundle, parameters: Parameters) -> System:
     """The normal equations at ``parameters``."""
+    from scipy.sparse import csr_array
+
     poses, lenses, size = bundle.columns
     by_camera, by_body, columns = _derivatives(bundle, parameters)
     residuals = bundle.residuals(parameters)
@@ -176,18 +179,19 @@ def linearized(bundle: Bundle, parameters: Parameters) -> System:
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
     np.add.at(V, bundle.observations.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
     np.add.at(body_gradient, bundle.observations.body, np.einsum("m,mai,ma->mi", weight, by_body, residuals))
-    return System(
-        A, V, _crossed(bundle, weight, by_camera, by_body, columns, (total, count * size)), gradient, body_gradient
-    )
+    blocks = np.einsum("m,mai,maj->mij", weight, by_camera, by_body)
+    rows = np.broadcast_to(columns[:, :, None], blocks.shape).ravel()
+    bodies = size * bundle.observations.body[:, None, None] + np.arange(size)
+    where = rows, np.broadcast_to(bodies, blocks.shape).ravel()
+    W = csr_array((blocks.ravel(), where), shape=(total, count * size))
+    return System(A, V, W, gradient, body_gradient)
 
 
 def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats, Indices]:
     """Of the misses by their camera's parameters ``[M, 2, 6 + F]`` and by their body's, and the former's unknowns."""
-    seen, (poses, _, _) = bundle.observations, bundle.columns
-    own, lens = seen.camera, bundle.lens[seen.camera]
-    on_body = np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
-    turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
-    local = turned + parameters.translations[own]
+    own, (poses, _, _) = bundle.observations.camera, bundle.columns
+    lens = bundle.lens[own]
+    on_body, turned, local = bundle.in_cameras(parameters)
     by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
     by_camera = np.concatenate([by_point @ cross_matrices(-turned), by_point, by_row], 2)
     by_world = by_point @ parameters.rotations[own]
@@ -197,18 +201,6 @@ def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats
     return by_camera, by_body, columns
 
 
-def _crossed(
-    bundle: Bundle, weight: Floats, by_camera: Floats, by_body: Floats, columns: Indices, shape: tuple[int, int]
-) -> Any:
-    from scipy.sparse import csr_array
-
-    size = bundle.columns[2]
-    blocks = np.einsum("m,mai,maj->mij", weight, by_camera, by_body)
-    rows = np.broadcast_to(columns[:, :, None], blocks.shape)
-    bodies = size * bundle.observations.body[:, None, None] + np.arange(size)
-    return csr_array((blocks.ravel(), (rows.ravel(), np.broadcast_to(bodies, blocks.shape).ravel())), shape=shape)
-
-
 def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floats) -> Parameters:
     poses, lenses, _ = bundle.columns
     by_pose = step[:poses].reshape(-1, 6)
@@ -216,10 +208,10 @@ def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floa
     rows[:, bundle.free] += step[poses : poses + lenses].reshape(len(rows), -1)
     body_rotations = parameters.body_rotations
     if bundle.rotating:
-        body_rotations = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ body_rotations
+        body_rotations = np.stack([*map(rotation_matrix, body_step[:, :3])]) @ body_rotations
     return replace(
         parameters,
-        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ parameters.rotations,
+        rotations=np.stack([*map(rotation_matrix, by_pose[:, :3])]) @ parameters.rotations,
         translations=parameters.translations + by_pose[:, 3:],
         rows=rows,
         body_rotations=body_rotations,
@@ -251,17 +243,15 @@ def adjust_together(
     observations that are more than ``pixels`` off. ``lens`` has the number of the lens of each camera; cameras with
     shared intrinsics have one. Lenses of one picture size share a mean; where ``makes`` has a number for each camera,
     those of one number."""
-    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), makes)
-    bundle, parameters = estimated(bundle, parameters)
-    adjusted = replace(
-        found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions
-    )
-    inliers = cleaned(adjusted, pixels=pixels)
+
+    def adjusted(found: SolvedCalibration, parameters: Parameters) -> SolvedCalibration:
+        cameras = cameras_in(parameters, found.cameras, bundle.lens)
+        return cleaned(replace(found, cameras=cameras, points=parameters.body_positions), pixels=pixels)
+
+    bundle, parameters = estimated(*_problem(found, np.asarray(lens, np.intp), tuple(free), makes))
+    inliers = adjusted(found, parameters)
     again, parameters = _problem(inliers, bundle.lens, bundle.free, makes)
-    again = replace(again, prior=bundle.prior, noise=bundle.noise)
-    parameters = solved(again, parameters)
-    cameras = cameras_in(parameters, inliers.cameras, again.lens)
-    return cleaned(replace(inliers, cameras=cameras, points=parameters.body_positions), pixels=pixels)
+    return adjusted(inliers, solved(replace(again, prior=bundle.prior, noise=bundle.noise), parameters))
 
 
 def cleaned(found: SolvedCalibration, *, pixels: float) -> SolvedCalibration:
@@ -286,8 +276,7 @@ def _problem(
 ) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
     observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
-    rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
-    bodies = rotations, found.points
+    bodies = np.broadcast_to(np.eye(3), (len(found.points), 3, 3)), found.points
     return posed_problem(cameras, observations, bodies, lens=lens, free=free, rotating=False, makes=makes)
 
 
@@ -339,12 +328,9 @@ def _with_noise(bundle: Bundle, parameters: Parameters) -> Bundle:
 
 def cameras_in(parameters: Parameters, cameras: Mapping[str, LensCamera], lens: Indices) -> dict[str, LensCamera]:
     """``cameras`` with the poses and lenses of the parameters."""
-    adjusted = {}
-    for index, (name, filmed) in enumerate(cameras.items()):
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = parameters.rotations[index], parameters.translations[index]
-        adjusted[name] = with_row(filmed, parameters.rows[lens[index]], viewmat)
-    return adjusted
+    poses = map(rigid, parameters.rotations, parameters.translations)
+    parts = zip(cameras.items(), parameters.rows[lens], poses, strict=True)
+    return {name: with_row(filmed, row, viewmat) for (name, filmed), row, viewmat in parts}
 
 
 def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:

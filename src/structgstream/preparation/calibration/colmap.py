@@ -6,16 +6,17 @@ camera poses with OpenCV axes, so nothing is converted but names and orders of p
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import astuple
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera
+from structgstream.data.calibration import rigid
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.data.prepared import camera_of
 from structgstream.errors import import_extra
 from structgstream.preparation.calibration.lens_terms import LensModel
 
@@ -35,6 +36,12 @@ def pycolmap_module() -> ModuleType:
     pycolmap = import_extra("pycolmap", "sfm")
     pycolmap.logging.minloglevel = QUIET
     return pycolmap
+
+
+def colmap_cameras(cameras: Mapping[str, LensCamera], models: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """:func:`colmap_camera` of each, numbered from 1 on, of ``models`` by name."""
+    numbers = dict(zip(cameras, range(1, len(cameras) + 1), strict=True))
+    return {name: colmap_camera(own, numbers[name], model=(models or {}).get(name)) for name, own in cameras.items()}
 
 
 def colmap_camera(filmed: LensCamera, number: int, *, model: str | None = None) -> Any:
@@ -76,10 +83,8 @@ def filmed_camera(camera: Any, cam_from_world: Any) -> LensCamera:
         lens = Fisheye(*terms)
     elif any(terms) or camera.model_name == "RADIAL":
         lens = RadialTangential(*terms)
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(np.array(cam_from_world.matrix()))
-    return LensCamera(Camera(viewmat, K, camera.width, camera.height), lens)
+    K, pose = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], cam_from_world.matrix()
+    return LensCamera(camera_of(rigid(pose[:, :3], pose[:, 3]), K, (camera.width, camera.height)), lens)
 
 
 def colmap_pose(viewmat: NDArray[np.float64]) -> Any:

@@ -9,12 +9,13 @@ Among all keypoints of a picture many look alike; among those of one epipolar pl
 little texture gets several times the matches once poses are known roughly.
 """
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
 from threading import Event
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,11 @@ INSTANTS = 3  # that are looked at before keypoints are counted, and then again
 ENOUGH = 6000
 """Keypoints of a camera, in the median over cameras, beyond which no further instants are looked at. Where little has
 texture, people who move about add keypoints."""
+
+
+WORKERS = os.cpu_count() or 1  # threads
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,13 @@ def _merged(known: Keypoints, instant: int, pixels: Floats, descriptors: NDArray
     )
 
 
-def all_keypoints(pictures: Mapping[str, Sequence[NDArray[np.uint8]]], *, workers: int) -> dict[str, Keypoints]:
+def of_each(keys: Collection[Key], function: Callable[[Key], Value]) -> dict[Key, Value]:
+    """The results of ``function`` by what it is of, in threads."""
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return dict(zip(keys, pool.map(function, keys), strict=True))
+
+
+def all_keypoints(pictures: Mapping[str, Sequence[NDArray[np.uint8]]]) -> dict[str, Keypoints]:
     """Covariant SIFT keypoints with domain-size pooling of still cameras' pictures ``[H, W, 3]``, one an instant; those
     of a camera are merged. From as many instants as give enough; an interruption is noticed between two pictures.
 
@@ -70,18 +82,14 @@ def all_keypoints(pictures: Mapping[str, Sequence[NDArray[np.uint8]]], *, worker
     order = spread_order(min(map(len, pictures.values()), default=0))
     found: dict[str, Keypoints] = {}
     for start in range(0, len(order), INSTANTS):
-        found = _with_instants(pictures, found, sorted(order[start : start + INSTANTS]), workers=workers)
+        found = _with_instants(pictures, found, sorted(order[start : start + INSTANTS]))
         if np.median([len(own) for own in found.values()]) >= ENOUGH:
             break
     return found
 
 
 def _with_instants(
-    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
-    known: Mapping[str, Keypoints],
-    instants: Sequence[int],
-    *,
-    workers: int,
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]]], known: Mapping[str, Keypoints], instants: Sequence[int]
 ) -> dict[str, Keypoints]:
     stopping = Event()
 
@@ -94,7 +102,7 @@ def _with_instants(
             found = _merged(found, instant, *_extracted(extractor, pictures[name][instant]))
         return found
 
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(WORKERS) as pool:
         try:
             return dict(zip(pictures, pool.map(one, pictures), strict=True))
         except BaseException:
@@ -136,9 +144,9 @@ def _extracted(extractor: Any, picture: NDArray[np.uint8]) -> tuple[Floats, NDAr
     return places * (width / grey.shape[1], height / grey.shape[0]), descriptors / np.maximum(norms, 1e-9)
 
 
-def roving_keypoints(pictures: Mapping[str, NDArray[np.uint8]], *, instants: int, workers: int) -> dict[str, Keypoints]:
+def roving_keypoints(pictures: Mapping[str, NDArray[np.uint8]], *, instants: int) -> dict[str, Keypoints]:
     """Keypoints of each frame of a roving camera; they are matched with those of any of ``instants`` instants."""
-    found = _with_instants({name: [picture] for name, picture in pictures.items()}, {}, [0], workers=workers)
+    found = _with_instants({name: [picture] for name, picture in pictures.items()}, {}, [0])
     return {name: replace(own, seen=np.ones((len(own), instants), bool)) for name, own in found.items()}
 
 
@@ -159,8 +167,6 @@ def _repeated(known: Keypoints, pixels: Floats, descriptors: NDArray[np.float32]
 
 
 MIN_SINE = 0.02  # rays along the baseline belong to every epipolar plane
-
-
 RATIO = 0.85  # largest ratio of the best to the second-best descriptor distance
 GUIDED_RATIO = 0.8  # the same of the best in an epipolar plane to its rivals
 MAX_DISTANCE = 0.8  # of the descriptors of a match; unit descriptors are at most sqrt(2) apart
@@ -175,13 +181,11 @@ def keypoint_matches(first: Keypoints, second: Keypoints) -> NDArray[np.uint32]:
 
 
 def all_matches(
-    keypoints: Mapping[str, Keypoints], *, workers: int, pairs: Sequence[Pair] | None = None
+    keypoints: Mapping[str, Keypoints], pairs: Sequence[Pair] | None = None
 ) -> dict[Pair, NDArray[np.uint32]]:
     """:func:`keypoint_matches` of every pair of cameras, or of some."""
     pairs = list(combinations(keypoints, 2)) if pairs is None else pairs
-    with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]]), pairs)
-        return dict(zip(pairs, found, strict=True))
+    return of_each(pairs, lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]]))
 
 
 def camera_rays(filmed: LensCamera, pixels: Floats) -> Floats:
@@ -246,11 +250,7 @@ def _plane_angles(
 
 
 def guided_matches(
-    keypoints: Mapping[str, Keypoints],
-    cameras: Mapping[str, LensCamera],
-    *,
-    pixels: float,
-    workers: int,
+    keypoints: Mapping[str, Keypoints], cameras: Mapping[str, LensCamera], *, pixels: float
 ) -> dict[Pair, NDArray[np.uint32]]:
     """Matches ``[S, 2]`` of cameras that look the same way: each other's best ones among those near one epipolar plane.
 
@@ -266,9 +266,7 @@ def guided_matches(
         found = mutually_best(first, second, row[together], column[together], ratio=GUIDED_RATIO, distance=MAX_DISTANCE)
         return found.astype(np.uint32)
 
-    pairs = _facing(cameras)
-    with ThreadPoolExecutor(workers) as pool:
-        return dict(zip(pairs, pool.map(one, pairs), strict=True))
+    return of_each(_facing(cameras), one)
 
 
 def _facing(cameras: Mapping[str, LensCamera]) -> Sequence[Pair]:

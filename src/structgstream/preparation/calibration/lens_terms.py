@@ -15,7 +15,7 @@ shares. The mean and how far lenses differ from it are estimated, by expectation
 where the pictures distinguish lenses they differ, and where they do not they are pooled."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Literal
 
@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.geometry import Floats, Indices
 
@@ -58,16 +57,14 @@ def with_row(filmed: LensCamera, row: Floats, viewmat: Floats) -> LensCamera:
     longest = max(own.width, own.height)
     focal = math.exp(row[FOCAL]) * longest
     across, down = own.width / 2 + row[ACROSS] * longest, own.height / 2 + row[DOWN] * longest
-    K = torch.tensor(
-        [[focal, 0.0, across], [0.0, focal * math.exp(row[ASPECT]), down], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
+    K = torch.tensor([[focal, 0, across], [0, focal * math.exp(row[ASPECT]), down], [0, 0, 1]], dtype=torch.float64)
     terms = [float(value) for value in row[4:]]
     lens: Lens = Pinhole()
     if isinstance(filmed.lens, Fisheye):
         lens = Fisheye(*terms[:4])
     elif any(terms):
         lens = RadialTangential(*terms)
-    return LensCamera(Camera(torch.from_numpy(viewmat), K, own.width, own.height, near=own.near), lens)
+    return LensCamera(replace(own, viewmat=torch.from_numpy(viewmat), K=K), lens)
 
 
 def projected(local: Floats, rows: Floats, sizes: Floats, fisheye: NDArray[np.bool_]) -> Floats:
@@ -185,10 +182,8 @@ class LensPrior:
 
     def cost(self, rows: Floats) -> float:
         """Minus the logarithm of the density, but for a constant."""
-        return sum(
-            float(rows[lenses, term] @ precision @ rows[lenses, term]) / 2
-            for lenses, term, precision in self._precisions()
-        )
+        found = ((rows[lenses, term], precision) for lenses, term, precision in self._precisions())
+        return sum(float(own @ precision @ own) / 2 for own, precision in found)
 
     def add(self, A: Floats, gradient: Floats, rows: Floats, *, start: int, free: Sequence[int]) -> None:
         """Adds it to normal equations in which the free terms of the lenses come, row by row, from ``start`` on."""
@@ -221,14 +216,12 @@ class LensPrior:
         mean, own = self.means[group, column] ** 2, self.differences[group, column] ** 2
         return mean / (own + mean * int((self.group == group).sum()))
 
-    def _precisions(self) -> list[tuple[Indices, int, Floats]]:
+    def _precisions(self) -> Iterator[tuple[Indices, int, Floats]]:
         """Of each group and term: the lenses, and the inverse of their covariance once the mean is integrated out."""
-        found = []
         for group, column in np.ndindex(self.differences.shape):
             lenses = np.flatnonzero(self.group == group)
             inverse = (np.eye(len(lenses)) - self._pull(group, column)) / self.differences[group, column] ** 2
-            found.append((lenses, self.terms[column], inverse))
-        return found
+            yield lenses, self.terms[column], inverse
 
 
 def usual_prior(group: Indices, free: Sequence[int], *, fisheye: bool) -> LensPrior:

@@ -8,10 +8,8 @@ walls, at one depth, where a camera's place can be exchanged for its focal lengt
 near the epipolar lines of the first solution are more, and of more depths.
 """
 
-import os
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,13 +22,14 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.geometry import Indices
 from structgstream.preparation.calibration.bundle import MIN_DEGREES, chosen
-from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
+from structgstream.preparation.calibration.colmap import colmap_cameras, colmap_pose, filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
     Keypoints,
     agreeing_matches,
     all_keypoints,
     all_matches,
     guided_matches,
+    of_each,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
@@ -45,9 +44,7 @@ agree by chance; among those of 0.3 and more nearly all were right."""
 MAX_TRIALS = 2000  # samples of the robust estimation
 
 
-def verified_pairs(
-    keypoints: Mapping[str, Keypoints], matches: Matches, cameras: Mapping[str, Any], *, workers: int
-) -> dict[Pair, Any]:
+def verified_pairs(keypoints: Mapping[str, Keypoints], matches: Matches, cameras: Mapping[str, Any]) -> dict[Pair, Any]:
     """Two-view geometries of the pairs that pass, with the matches that agree; ``cameras`` are of pycolmap, with the
     focal lengths to begin with."""
     pycolmap = pycolmap_module()
@@ -65,9 +62,7 @@ def verified_pairs(
             one, keypoints[pair[0]].pixels, two, keypoints[pair[1]].pixels, matches[pair], options
         )
 
-    pairs = [pair for pair, found in matches.items() if len(found) >= MIN_MATCHES]
-    with ThreadPoolExecutor(workers) as pool:
-        found = dict(zip(pairs, pool.map(estimate, pairs), strict=True))
+    found = of_each([pair for pair, rows in matches.items() if len(rows) >= MIN_MATCHES], estimate)
     return {
         pair: geometry
         for pair, geometry in found.items()
@@ -122,9 +117,14 @@ def mapped(database: Path, *, mapper: Mapper, stills: Collection[str]) -> Any | 
     return max(found.values(), key=lambda model: size_of(model, stills), default=None)
 
 
+def placed_in(model: Any) -> list[str]:
+    """Names of the cameras that a model places."""
+    return [model.image(number).name for number in model.reg_image_ids()]
+
+
 def size_of(model: Any, stills: Collection[str]) -> tuple[int, int, int]:
     """How large a model is: images of still cameras, all images, observations."""
-    names = [model.image(number).name for number in model.reg_image_ids()]
+    names = placed_in(model)
     return sum(name in stills for name in names), len(names), model.compute_num_observations()
 
 
@@ -237,11 +237,9 @@ def posed_graph(
 ) -> PosedGraph:
     """Keypoints and matches near the epipolar lines of the poses, verified pair by pair without them."""
     pycolmap_module()
-    workers = max(1, min(len(pictures), os.cpu_count() or 1))
-    keypoints = all_keypoints({name: pictures[name] for name in cameras}, workers=workers)
-    near = agreeing_matches(keypoints, all_matches(keypoints, workers=workers), cameras, degrees=slack_degrees)
-    numbered = {name: colmap_camera(filmed, index) for index, (name, filmed) in enumerate(cameras.items(), 1)}
-    return PosedGraph(keypoints, verified_pairs(keypoints, near, numbered, workers=workers))
+    keypoints = all_keypoints({name: pictures[name] for name in cameras})
+    near = agreeing_matches(keypoints, all_matches(keypoints), cameras, degrees=slack_degrees)
+    return PosedGraph(keypoints, verified_pairs(keypoints, near, colmap_cameras(cameras)))
 
 
 def triangulated(graph: PosedGraph, cameras: Mapping[str, LensCamera], *, pixels: float) -> SolvedCalibration:
@@ -268,10 +266,7 @@ def posed_model(
         models: COLMAP's camera model by name, where it is not the smallest that holds the lens.
     """
     pycolmap = pycolmap_module()
-    numbered = {
-        name: colmap_camera(filmed, index, model=None if models is None else models[name])
-        for index, (name, filmed) in enumerate(cameras.items(), 1)
-    }
+    numbered = colmap_cameras(cameras, models)
     model = pycolmap.Reconstruction()
     for camera in numbered.values():
         model.add_camera_with_trivial_rig(camera)
@@ -309,7 +304,6 @@ def rematched(
     *,
     pixels: float,
     adjust: Callable[[SolvedCalibration], SolvedCalibration],
-    workers: int,
 ) -> SolvedCalibration:
     """The first solution ``found`` adjusted to more points (Note [What a first solution lacks]); itself if it has
     enough, little is gained or a camera loses some. Observations may be ``pixels`` off; ``adjust`` adjusts cameras and
@@ -317,9 +311,8 @@ def rematched(
     before = _counts(found)
     if before.min() >= ENOUGH:
         return found
-    guided = guided_matches(keypoints, found.cameras, pixels=pixels, workers=workers)
     pycolmap, geometries = pycolmap_module(), {}
-    for pair, rows in guided.items():
+    for pair, rows in guided_matches(keypoints, found.cameras, pixels=pixels).items():
         if len(rows):
             geometries[pair] = pycolmap.TwoViewGeometry()
             geometries[pair].config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED

@@ -34,10 +34,6 @@ class RovingFrames:
     median_pixels: float  # of their reprojection errors
     bridged: tuple[str, ...] = ()  # still cameras that could not be placed without them
 
-    def aligned(self, alignment: Alignment) -> "RovingFrames":
-        """The same frames in other coordinates."""
-        return replace(self, cameras={name: alignment.filmed(filmed) for name, filmed in self.cameras.items()})
-
     @property
     def summary(self) -> str:
         """For users."""
@@ -72,12 +68,16 @@ class SolvedCalibration:
 
     def aligned(self, alignment: Alignment, *, metres: bool | None = None) -> "SolvedCalibration":
         """The same calibration in other coordinates; pictures and errors stay what they are."""
+
+        def moved(cameras: Mapping[str, LensCamera]) -> dict[str, LensCamera]:
+            return {name: alignment.filmed(filmed) for name, filmed in cameras.items()}
+
         return replace(
             self,
-            cameras={name: alignment.filmed(filmed) for name, filmed in self.cameras.items()},
+            cameras=moved(self.cameras),
             points=alignment.points(self.points),
             metres=self.metres if metres is None else metres,
-            roving=None if self.roving is None else self.roving.aligned(alignment),
+            roving=None if self.roving is None else replace(self.roving, cameras=moved(self.roving.cameras)),
         )
 
 

@@ -8,7 +8,6 @@ and Frahm, CVPR 2016; Pan et al., ECCV 2024 for the global one).
 
 import logging
 import math
-import os
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +41,7 @@ from structgstream.preparation.calibration.mapping import (
     filter_model,
     mapped,
     observed,
+    placed_in,
     posed_graph,
     posed_model,
     rematched,
@@ -97,21 +97,18 @@ def solve_structure(
         CalibrationError: pictures that do not belong together, too little in common, or no roving frame that has.
     """
     pycolmap_module()
-    workers = max(1, min(len(pictures), os.cpu_count() or 1))
-    keypoints = all_keypoints(pictures, workers=workers)
-    matches = all_matches(keypoints, workers=workers)
+    keypoints = all_keypoints(pictures)
+    matches = all_matches(keypoints)
     sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
-    starts = _starts(sizes, lens, intrinsics, _fields_of_view(sizes, lens, focals or {}))
-    best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
+    starts = _starts(sizes, lens, intrinsics, focals or {})
+    alone = best = _best_attempt(keypoints, matches, starts, stills=pictures)
     frames: Mapping[str, NDArray[np.uint8]] = roving or {}
-    alone = best
     if frames:
         instants = next(iter(keypoints.values())).seen.shape[1]
-        walked = roving_keypoints(frames, instants=instants, workers=workers)
-        keypoints = {**keypoints, **walked}
-        matches = {**matches, **all_matches(keypoints, workers=workers, pairs=_roving_pairs([*pictures], [*frames]))}
+        keypoints = {**keypoints, **roving_keypoints(frames, instants=instants)}
+        matches = {**matches, **all_matches(keypoints, _roving_pairs([*pictures], [*frames]))}
         starts = [_with_roving(start, frames, lens) for start in starts]
-        best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
+        best = _best_attempt(keypoints, matches, starts, stills=pictures)
         if best.size[0] == 0 or best.size[0] == best.size[1]:
             raise CalibrationError(_nothing_roving(keypoints, matches, best.pairs, [*frames]))
         if best.size[0] < 3:
@@ -121,9 +118,10 @@ def solve_structure(
             )
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, frames, lens=lens, workers=workers)
-    if frames and solved.roving is not None:
-        bridged = tuple(name for name in solved.cameras if name not in _placed(alone))
+    solved = _finished(best, keypoints, pictures, frames, lens=lens)
+    if solved.roving is not None:
+        placed = [] if alone.model is None else placed_in(alone.model)
+        bridged = tuple(name for name in solved.cameras if name not in placed)
         solved = replace(solved, roving=replace(solved.roving, bridged=bridged))
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
@@ -134,29 +132,32 @@ NEIGHBOURS = 4  # frames of a roving camera that are matched with the next so ma
 ENOUGH_ROVING = 0.5  # share of the roving frames that a start places, with all still cameras, for no other to be tried
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """A model from one start, None without one, and the pairs that it is made from."""
+
+    model: Any | None
+    pairs: Mapping[Pair, Any]
+    size: tuple[int, int, int] = (0, 0, 0)  # of the model
+
+
 def _best_attempt(
     keypoints: Mapping[str, Keypoints],
     matches: Matches,
     starts: Sequence[Mapping[str, Any]],
     *,
     stills: Collection[str],
-    workers: int,
-) -> "_Attempt":
+) -> _Attempt:
     """That of the largest model, of those before all still cameras and enough of the others are placed."""
     best: _Attempt | None = None
     enough = len(stills) + ENOUGH_ROVING * (len(starts[0]) - len(stills))
     for cameras in starts:
-        attempt = _attempt(keypoints, matches, cameras, stills=stills, workers=workers)
+        attempt = _attempt(keypoints, matches, cameras, stills=stills)
         best = attempt if best is None or attempt.size > best.size else best
         if best.size[0] == len(stills) and best.size[1] >= enough:
             break
     assert best is not None
     return best
-
-
-def _placed(attempt: "_Attempt") -> set[str]:
-    model = attempt.model
-    return set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
 
 
 def _roving_pairs(stills: Sequence[str], frames: Sequence[str]) -> list[Pair]:
@@ -181,17 +182,15 @@ def _nothing_roving(
     keypoints: Mapping[str, Keypoints], matches: Matches, pairs: Mapping[Pair, Any], frames: Sequence[str]
 ) -> str:
     """Why no frame of the roving camera could be placed."""
-    counts = [
-        np.median([len(keypoints[name]) for name in keypoints if (name in frames) == own]) for own in (True, False)
-    ]
-    if counts[0] < BLURRED * counts[1]:
+    walked = np.median([len(keypoints[name]) for name in frames])
+    still = np.median([len(own) for name, own in keypoints.items() if name not in frames])
+    if walked < BLURRED * still:
         return (
-            f"The roving video is blurred, or of bare surfaces: its sharpest frames have {counts[0]:.0f} keypoints, "
-            f"the cameras {counts[1]:.0f}; walk slower, with more light and what the cameras see, or leave out "
-            "--roving."
+            f"The roving video is blurred, or of bare surfaces: its sharpest frames have {walked:.0f} keypoints, the "
+            f"cameras {still:.0f}; walk slower, with more light and what the cameras see, or leave out --roving."
         )
     with_stills = [pair for pair in matches if (pair[0] in frames) != (pair[1] in frames)]
-    best = max((len(pairs[pair].inlier_matches) if pair in pairs else 0 for pair in with_stills), default=0)
+    best = max((_agreeing(pairs, pair) for pair in with_stills), default=0)
     return (
         f"No roving frame can be placed among the cameras (at best {best} matches agree between a frame and a camera): "
         "film the same set, with what the cameras see in view, or leave out --roving."
@@ -199,53 +198,33 @@ def _nothing_roving(
 
 
 BLURRED = 0.2  # share of the keypoints of a still camera below which roving frames are blurred
+REMEDY = "Let neighbouring cameras see more of the same, take more instants, or film a board (structgstream board)."
+
+
+def _agreeing(pairs: Mapping[Pair, Any], pair: Pair) -> int:
+    """Number of matches of a pair that agree."""
+    return len(pairs[pair].inlier_matches) if pair in pairs else 0
 
 
 def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     """One sentence for each camera that could not be placed: with whom it has how many matches."""
     reasons = []
     for name in missing:
-        others = {
-            (pair[1] if name == pair[0] else pair[0]): (
-                len(pairs[pair].inlier_matches) if pair in pairs else 0, len(found),
-            )
-            for pair, found in matches.items()
-            if name in pair
-        }  # fmt: skip
-        best = sorted(others, key=lambda other: -others[other][0])[:2]
-        best_pairs = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
-        reasons.append(f"{name!r} ({best_pairs} agree)")
+        best = sorted((pair for pair in matches if name in pair), key=lambda pair: -_agreeing(pairs, pair))[:2]
+        others = [next(other for other in pair if other != name) for pair in best]
+        agree = " and ".join(
+            f"{_agreeing(pairs, pair)} of {len(matches[pair])} matches with {other!r}"
+            for pair, other in zip(best, others, strict=True)
+        )
+        reasons.append(f"{name!r} ({agree} agree)")
     return (
         f"{listed(missing)} could not be placed: {'; '.join(reasons)}. Let neighbouring cameras see more of the same "
         "from at most 30 degrees apart, take more instants, or film a board (structgstream board)."
     )
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    """A model from one start, None without one, and the pairs that it is made from."""
-
-    model: Any | None
-    pairs: Mapping[Pair, Any]
-    size: tuple[int, int, int] = (0, 0, 0)  # of the model
-
-
-def _fields_of_view(
-    sizes: Mapping[str, tuple[int, int]], lens: LensModel, focals: Mapping[str, float]
-) -> list[dict[str, float]]:
-    """Degrees by camera, for each start that is tried."""
-    tried = [dict.fromkeys(sizes, degrees) for degrees in FIELDS_OF_VIEW[lens]]
-    if likely := {name: field_of_view(lens, focal, sizes[name]) for name, focal in focals.items() if name in sizes}:
-        middle = float(np.median(list(likely.values())))
-        tried.insert(0, {name: likely.get(name, middle) for name in sizes})
-    return tried
-
-
 def _starts(
-    sizes: Mapping[str, tuple[int, int]],
-    lens: LensModel,
-    intrinsics: Intrinsics,
-    tried: Sequence[Mapping[str, float]],
+    sizes: Mapping[str, tuple[int, int]], lens: LensModel, intrinsics: Intrinsics, focals: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """Cameras of pycolmap to begin with, for each start that is tried."""
     if intrinsics == "shared" and len(set(sizes.values())) > 1:
@@ -253,15 +232,17 @@ def _starts(
             "Shared intrinsics need pictures of one size, got "
             f"{', '.join(sorted({f'{w}x{h}' for w, h in sizes.values()}))}; use own intrinsics."
         )
-    starts = []
-    for degrees in tried:
-        middle = float(np.median(list(degrees.values())))
-        own = {name: (number, degrees[name]) for number, name in enumerate(sizes, 1)}
-        chosen = dict.fromkeys(sizes, (1, middle)) if intrinsics == "shared" else own
-        starts.append(
-            {name: guessed_camera(lens, chosen[name][0], size, chosen[name][1]) for name, size in sizes.items()}
-        )
-    return starts
+    tried = [dict.fromkeys(sizes, degrees) for degrees in FIELDS_OF_VIEW[lens]]
+    if likely := {name: field_of_view(lens, focal, sizes[name]) for name, focal in focals.items() if name in sizes}:
+        middle = float(np.median(list(likely.values())))
+        tried.insert(0, {name: likely.get(name, middle) for name in sizes})
+    if intrinsics == "shared":
+        tried = [dict.fromkeys(sizes, float(np.median(list(degrees.values())))) for degrees in tried]
+    numbers = {name: 1 if intrinsics == "shared" else number for number, name in enumerate(sizes, 1)}
+    return [
+        {name: guessed_camera(lens, numbers[name], size, degrees[name]) for name, size in sizes.items()}
+        for degrees in tried
+    ]
 
 
 def _attempt(
@@ -270,10 +251,9 @@ def _attempt(
     cameras: Mapping[str, Any],
     *,
     stills: Collection[str],
-    workers: int,
 ) -> _Attempt:
     """The incremental model, or the global one if that places more still cameras."""
-    pairs = verified_pairs(keypoints, matches, cameras, workers=workers)
+    pairs = verified_pairs(keypoints, matches, cameras)
     attempt = _Attempt(None, pairs)
     if not pairs:
         return attempt
@@ -297,7 +277,6 @@ def _finished(
     roving: Mapping[str, NDArray[np.uint8]],
     *,
     lens: LensModel,
-    workers: int,
 ) -> SolvedCalibration:
     """The model with all intrinsics adjusted, without outliers, in normalised coordinates; without roving frames, of
     which each camera has matches enough, matched again."""
@@ -324,9 +303,7 @@ def _finished(
     )
     if roving:
         return normalized(_split(adjusted(normalized(rough)), roving))
-    return normalized(
-        rematched(normalized(adjusted(rough)), keypoints, pixels=pixels, adjust=adjusted, workers=workers)
-    )
+    return normalized(rematched(normalized(adjusted(rough)), keypoints, pixels=pixels, adjust=adjusted))
 
 
 def _split(found: SolvedCalibration, roving: Collection[str]) -> SolvedCalibration:
@@ -344,20 +321,19 @@ def _split(found: SolvedCalibration, roving: Collection[str]) -> SolvedCalibrati
 
 
 def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
-    alone = [name for name in pictures if not any(name in pair for pair in pairs)]
-    if not alone:
-        groups = connected_groups(pictures, pairs)
-        return (
-            f"The pictures of {len(pictures)} cameras give no model: {len(pairs)} of {len(matches)} pairs have matches "
-            f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])}). Let "
-            "neighbouring cameras see more of the same, take more instants, or film a board (structgstream board)."
+    """Why no three cameras could be placed."""
+    if alone := [name for name in pictures if not any(name in pair for pair in pairs)]:
+        reason = (
+            f"Too few cameras see anything in common: {listed(alone)} {'has' if len(alone) == 1 else 'have'} no pair "
+            f"with enough matches that agree ({len(pairs)} of {len(matches)} pairs have)"
         )
-    has = "has" if len(alone) == 1 else "have"
-    return (
-        f"Too few cameras see anything in common: {listed(alone)} {has} no pair with enough matches that agree "
-        f"({len(pairs)} of {len(matches)} pairs have). Let neighbouring cameras see more of the same, take more "
-        "instants, or film a board (structgstream board)."
-    )
+    else:
+        groups = connected_groups(pictures, pairs)
+        reason = (
+            f"The pictures of {len(pictures)} cameras give no model: {len(pairs)} of {len(matches)} pairs have matches "
+            f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])})"
+        )
+    return f"{reason}. {REMEDY}"
 
 
 SLACK_DEGREES = 1.5  # of matches to the epipolar planes of the given poses, so how wrong these may be

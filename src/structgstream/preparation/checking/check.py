@@ -230,16 +230,14 @@ def _camera_checks(
     found = {}
     for name in source.rig:
         color = examined.colors.get(name)
-        residuals = tracks.residuals[tracks.of(name) & (views[tracks.point] >= MIN_VIEWS)]
-        residuals = residuals[np.isfinite(residuals)]
+        solid = tracks.of(name) & (views[tracks.point] >= MIN_VIEWS) & np.isfinite(tracks.residuals)
+        residuals = tracks.residuals[solid]
         found[name] = CameraCheck(
             reprojection_pixels=float(np.median(residuals)) if len(residuals) else None,
             reprojection_pixels_90=float(np.percentile(residuals, 90)) if len(residuals) else None,
             points=len(residuals),
             overlaps=counts.get(name, 0),
-            exposure_stops=color.exposure_stops if color else None,
-            red_stops=color.red_stops if color else None,
-            blue_stops=color.blue_stops if color else None,
+            **(asdict(color) if color else {}),
             offset_ms=1e3 * late[name] if name in late else None,
             offset_uncertainty_ms=1e3 * times.uncertainty_seconds[name] if times is not None and name in late else None,
             frames_lacking=int((~presence[name]).sum()),
@@ -249,9 +247,5 @@ def _camera_checks(
 
 def _pair_checks(examined: Examination) -> tuple[PairCheck, ...]:
     errors = pair_errors(examined.evidence, examined.cameras)
-    return tuple(
-        PairCheck(*pair, errors[pair].matches, errors[pair].pixels, errors[pair].share)
-        if pair in errors
-        else PairCheck(*pair, 0, None, None)
-        for pair in examined.evidence.matches
-    )
+    checks = {pair: PairCheck(*pair, error.matches, error.pixels, error.share) for pair, error in errors.items()}
+    return tuple(checks.get(pair) or PairCheck(*pair, 0, None, None) for pair in examined.evidence.matches)

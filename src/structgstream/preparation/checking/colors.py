@@ -65,23 +65,17 @@ def compare_colors(evidence: Evidence) -> dict[str, Color]:
 
 def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
     """Warnings of cameras that were not locked alike."""
-    exposed = {name: color.exposure_stops for name, color in colors.items()}
+    exposure = {name: color.exposure_stops for name, color in colors.items()}
     balance = {name: max(color.red_stops, color.blue_stops, key=abs) for name, color in colors.items()}
-    exposed = {name: stops for name, stops in exposed.items() if abs(stops) > EXPOSURE_STOPS}
-    balance = {name: stops for name, stops in balance.items() if abs(stops) > BALANCE_STOPS}
     findings = []
-    if exposed:
-        sentence = (
-            f"Exposure differs from the other cameras', in stops: {_worst(exposed)}; lock exposure and gain to the "
-            "same values on all cameras (reconstruction equalises what is left)."
-        )
-        findings.append(Finding("warning", sentence, tuple(exposed)))
-    if balance:
-        sentence = (
-            f"White balance differs from the other cameras', in stops of red or blue against green: {_worst(balance)}; "
-            "lock it to the same value on all cameras."
-        )
-        findings.append(Finding("warning", sentence, tuple(balance)))
+    for stops, limit, differs, remedy in (
+        (exposure, EXPOSURE_STOPS, "Exposure differs from the other cameras', in stops",
+         "lock exposure and gain to the same values on all cameras (reconstruction equalises what is left)"),
+        (balance, BALANCE_STOPS, "White balance differs from the other cameras', in stops of red or blue against green",
+         "lock it to the same value on all cameras"),
+    ):  # fmt: skip
+        if off := {name: own for name, own in stops.items() if abs(own) > limit}:
+            findings.append(Finding("warning", f"{differs}: {_worst(off)}; {remedy}.", tuple(off)))
     return findings
 
 

@@ -52,14 +52,11 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
     Warnings where no camera has matches, the cameras fall apart into groups, or one has few overlaps.
     """
     if not pairs:
-        return [
-            Finding(
-                "warning",
-                f"No two of the {len(names)} cameras have enough matches to check their poses: too little overlap or "
-                "texture; look at the pictures of the report, and move the cameras closer together or add texture.",
-                tuple(names),
-            )
-        ]
+        sentence = (
+            f"No two of the {len(names)} cameras have enough matches to check their poses: too little overlap or "
+            "texture; look at the pictures of the report, and move the cameras closer together or add texture."
+        )
+        return [Finding("warning", sentence, tuple(names))]
     findings = []
     whole, *others = connected_groups(names, pairs)
     single = [group[0] for group in others if len(group) == 1]
@@ -113,12 +110,7 @@ def nearest_depth(depths: Floats) -> float | None:
 
 
 def scale_findings(
-    depths: Floats,
-    points: Floats | None,
-    cameras: Mapping[str, Camera],
-    *,
-    radius: float,
-    unit: str | None,
+    depths: Floats, points: Floats | None, cameras: Mapping[str, Camera], *, radius: float, unit: str | None
 ) -> list[Finding]:
     """What contradicts in lengths, which are in ``unit`` where the capture states it.
 
@@ -131,32 +123,26 @@ def scale_findings(
     if len(depths) >= MIN_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
         typical = float(np.median(depths))
         hint = "; poses and near plane look like different units of length" if near > 50 * typical else ""
-        findings.append(
-            Finding(
-                "error",
-                f"The near plane lies at {near:.4g}, beyond {cut:.0%} of the points, whose nearest are at "
-                f"{np.percentile(depths, NEAR_PERCENTILE):.4g} and whose median is at {typical:.4g}{hint}; set --near "
-                f"{0.5 * np.percentile(depths, NEAR_PERCENTILE):.3g}.",
-            )
+        nearest = np.percentile(depths, NEAR_PERCENTILE)
+        sentence = (
+            f"The near plane lies at {near:.4g}, beyond {cut:.0%} of the points, whose nearest are at {nearest:.4g} "
+            f"and whose median is at {typical:.4g}{hint}; set --near {0.5 * nearest:.3g}."
         )
+        findings.append(Finding("error", sentence))
     elif (nearest := nearest_depth(depths)) is not None and near < CLOSEST_NEAR * nearest:
-        findings.append(
-            Finding(
-                "warning",
-                f"The near plane lies at {near:.4g}, and the nearest points at {nearest:.4g}: poses and near plane look"
-                " like different units of length, as of positions in millimetres and a near plane in metres; convert"
-                f" one of them, or set --near {0.5 * nearest:.3g}.",
-            )
+        sentence = (
+            f"The near plane lies at {near:.4g}, and the nearest points at {nearest:.4g}: poses and near plane look "
+            "like different units of length, as of positions in millimetres and a near plane in metres; convert one of "
+            f"them, or set --near {0.5 * nearest:.3g}."
         )
+        findings.append(Finding("warning", sentence))
     if unit == "metres" and not PLAUSIBLE_METRES[0] <= radius <= PLAUSIBLE_METRES[1]:
         like = "millimetres or centimetres" if radius > 1 else "kilometres"
-        findings.append(
-            Finding(
-                "error",
-                f"The cameras stand up to {radius:.4g} from their middle, and the capture says metres: the positions "
-                f"look like {like}; convert them, or give a distance between two cameras.",
-            )
+        sentence = (
+            f"The cameras stand up to {radius:.4g} from their middle, and the capture says metres: the positions look "
+            f"like {like}; convert them, or give a distance between two cameras."
         )
+        findings.append(Finding("error", sentence))
     if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign(points, depths, cameras)):
         findings.append(Finding("error", sentence))
     return findings

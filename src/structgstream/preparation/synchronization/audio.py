@@ -187,8 +187,7 @@ def ambiguity_weights(lags: Sequence[PairLag]) -> list[float]:
 def _closes(three: Sequence[str], known: dict[tuple[str, str], PairLag]) -> bool:
     """Whether the same instant by the third camera comes out by both ways."""
     a, b, c = three
-    start = next(lag.middle for pair, lag in known.items() if set(pair) == {a, b})
-    start = start if (a, b) in known else known[b, a].at(start)
+    start = known[a, b].middle if (a, b) in known else known[b, a].at(known[b, a].middle)
     return abs(_mapped(known, b, c, _mapped(known, a, b, start)) - _mapped(known, a, c, start)) < CLOSING_SECONDS
 
 

@@ -275,10 +275,9 @@ def fitted_line(
     tried = np.arange(-MAX_RATE, MAX_RATE + RATE_STEP / 2, RATE_STEP) if rates else np.zeros(1)
     lags = np.arange(-NEAR_SAMPLES, NEAR_SAMPLES + LAG_STEP / 2, LAG_STEP)
     gains = _gains(blocks, (blocks.times - middle) / step, tried, lags, reach)
-    best = _best(gains, np.arange(len(blocks.times)), tried, lags)
-    without = np.array(
-        [_best(gains, np.delete(np.arange(len(blocks.times)), k), tried, lags) for k in range(len(blocks.times))]
-    )
+    every = np.arange(len(blocks.times))
+    best = _best(gains, every, tried, lags)
+    without = np.array([_best(gains, np.delete(every, k), tried, lags) for k in every])
     has_rate = len(tried) > 1 and bool(np.abs([best[1], *without[:, 1]]).max() < MAX_RATE - RATE_STEP)
     if not has_rate and len(tried) > 1:
         return fitted_line(first, second, expected_seconds=expected_seconds, edges=edges, rates=False)

@@ -27,7 +27,6 @@ from structgstream.preparation.synchronization.audio import (
 )
 from structgstream.preparation.synchronization.motion import (
     CalibratedGeometry,
-    Changes,
     Geometry,
     StaticGeometry,
     pair_signals,
@@ -67,16 +66,14 @@ def synchronization(
     common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
     _require_overlap(common)
     residuals = frame_residuals(common)
-    late = [name for name in stamps if abs(residuals[name]) > WARNED_SECONDS]
-    if late:
+    if late := [name for name in stamps if abs(residuals[name]) > WARNED_SECONDS]:
         worst = max(late, key=lambda name: abs(residuals[name]))
         warnings += (
             f"Nearest frames of {listed(late, 8)} are up to {abs(residuals[worst]) * 1e3:.1f} ms off the common "
             f"instants (camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal "
             "have no such rest.",
         )
-    vague = [name for name in stamps if uncertainties[name] > period_seconds(stamps[name]) / 4]
-    if vague:
+    if vague := [name for name in stamps if uncertainties[name] > period_seconds(stamps[name]) / 4]:
         warnings += (
             f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
@@ -166,7 +163,8 @@ def synchronize(
         table = read_timestamps(timestamps, stamps)
         return _stated(stamps, table, method="csv", reason=f"{timestamps.name} states times")
     if method == "none":
-        return _unchanged(stamps)
+        given = dict.fromkeys(stamps, StatedClock(Clock(), 0.0, "none"))
+        return _stated(stamps, given, method="none", reason="the cameras are said to be synchronous")
     if method == "stamps":
         found = wall_clocks(stamps, {name: footage.metadata(name) for name in stamps})
         reason = f"stamps of the files ({next(iter(found.values())).kind}) are said to share a clock"
@@ -199,11 +197,6 @@ def _stated(
 ) -> Synchronization:
     clocks, sigmas = ({name: getattr(own, key) for name, own in found.items()} for key in ("clock", "sigma_seconds"))
     return synchronization(stamps, clocks, sigmas, method=method, reason=reason)
-
-
-def _unchanged(stamps: Mapping[str, Floats]) -> Synchronization:
-    clocks, exact = dict.fromkeys(stamps, Clock()), dict.fromkeys(stamps, 0.0)
-    return synchronization(stamps, clocks, exact, method="none", reason="the cameras are said to be synchronous")
 
 
 def _by_audio(footage: Footage, stamps: Mapping[str, Floats], reason: str) -> Synchronization:
@@ -241,7 +234,11 @@ def _by_motion(
 ) -> Synchronization:
     used = {name: own[own <= own[0] + MOTION_SECONDS] for name, own in stamps.items()}
     changes = {name: picture_changes(footage.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
-    require_motion(changes)
+    if still := [name for name, change in changes.items() if not change.moving]:
+        raise CaptureError(
+            f"Too little moves in the pictures of {', '.join(map(repr, still))} to synchronise by motion; film people "
+            f"who move in the first {MOTION_SECONDS:g} s, a clap for audio, or give timestamps.csv."
+        )
     geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(footage, used)
     period = max(period_seconds(own) for own in stamps.values())
     takes = {name: (float(own[0]), float(own[-1])) for name, own in used.items()}
@@ -254,16 +251,6 @@ def _by_motion(
         reason=reason,
         warnings=() if cameras else ("Motion was compared without calibration: synchronise again when it is known.",),
     )
-
-
-def require_motion(changes: Mapping[str, Changes]) -> None:
-    """Refuses cameras in which hardly anything moves."""
-    still = [name for name, change in changes.items() if not change.moving]
-    if still:
-        raise CaptureError(
-            f"Too little moves in the pictures of {', '.join(repr(name) for name in still)} to synchronise by "
-            f"motion; film people who move in the first {MOTION_SECONDS:g} s, a clap for audio, or give timestamps.csv."
-        )
 
 
 def _static_geometry(footage: Footage, stamps: Mapping[str, Floats]) -> StaticGeometry:
