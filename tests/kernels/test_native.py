@@ -12,7 +12,8 @@ import pytest
 from structgstream.errors import BackendError
 from structgstream.kernels import native
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES
-from structgstream.kernels.native import PROTOTYPES, TYPES, native_library, native_reason
+from structgstream.kernels.native import PROTOTYPES, TYPES, native_library
+from tests.support.backends import needs_native
 
 
 @pytest.fixture(autouse=True)
@@ -113,7 +114,7 @@ def test_the_table_is_the_header_s(header: str) -> None:
     assert TYPES.keys() == {*LETTERS.values(), "p", "s"}
 
 
-@pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
+@needs_native
 def test_a_call_with_other_arguments_is_refused() -> None:
     library = native_library()
     for name, (_, arguments) in PROTOTYPES.items():

@@ -10,16 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, reference_backend
-from structgstream.kernels.native import native_reason
+from structgstream.kernels.backend import Backend, cuda_backend, reference_backend
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.support.backends import PROCESSOR, on_each_backend
 from tests.support.rigs import arc_rig, random_scene
-
-native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
-BUILDERS = [
-    pytest.param(reference_backend, id="reference"),
-    pytest.param(cpu_backend, id="cpu", marks=native),
-]
 
 
 def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
@@ -33,7 +27,7 @@ def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
 
 
 @pytest.mark.usefixtures("pretended_gpu")
-@pytest.mark.parametrize("build", [*BUILDERS, cuda_backend])
+@pytest.mark.parametrize("build", [*PROCESSOR, cuda_backend])
 def test_signatures_are_those_of_the_table(build: Callable[[], Backend]) -> None:
     backend = build()
     assert len(Backend.operations()) == 20
@@ -55,7 +49,7 @@ def test_an_operation_that_the_table_lacks_or_a_back_end_lacks_is_refused() -> N
         replace(backend, functions={name: run for name, run in backend.functions.items() if name != "lift"})
 
 
-@pytest.mark.parametrize("build", BUILDERS)
+@on_each_backend
 def test_a_picture_is_drawn_onto_in_its_own_memory_and_nothing_else_changes(build: Callable[[], Backend]) -> None:
     backend, camera = build(), arc_rig()["cam01"]
     mask = torch.zeros(tile_grid(camera.width, camera.height), dtype=torch.bool)
@@ -81,7 +75,7 @@ def test_a_picture_is_drawn_onto_in_its_own_memory_and_nothing_else_changes(buil
     assert torch.equal(tiles.mask, mask)
 
 
-@pytest.mark.parametrize("build", BUILDERS)
+@on_each_backend
 def test_a_picture_to_draw_onto_needs_tiles(build: Callable[[], Backend]) -> None:
     camera = arc_rig()["cam01"]
     gaussians = random_scene(5).gaussians(camera, reference_backend())
@@ -89,7 +83,7 @@ def test_a_picture_to_draw_onto_needs_tiles(build: Callable[[], Backend]) -> Non
         build().rasterize(gaussians, camera.viewport(gaussians.means), onto=torch.rand(32, 48, 3))
 
 
-@pytest.mark.parametrize("build", BUILDERS)
+@on_each_backend
 def test_anchors_that_were_looked_at_are_ascending_indices(build: Callable[[], Backend]) -> None:
     backend = build()
     scene, camera = random_scene(300, seed=3), next(iter(arc_rig(radius=0.6).cameras.values()))
@@ -105,7 +99,7 @@ def test_anchors_that_were_looked_at_are_ascending_indices(build: Callable[[], B
     assert not found.gaussians.scales[~drawn].any()
 
 
-@pytest.mark.parametrize("build", BUILDERS)
+@on_each_backend
 def test_a_step_of_adam_leaves_the_gradient(build: Callable[[], Backend]) -> None:
     param, gradient, first, second = torch.rand(4, 3), torch.rand(4, 3), torch.zeros(4, 3), torch.zeros(4, 3)
     was, kept = param.clone(), gradient.clone()
@@ -116,7 +110,7 @@ def test_a_step_of_adam_leaves_the_gradient(build: Callable[[], Backend]) -> Non
     assert second.all()
 
 
-@pytest.mark.parametrize("build", BUILDERS)
+@on_each_backend
 def test_weights_of_blending_have_no_graph(build: Callable[[], Backend]) -> None:
     camera = arc_rig()["cam01"]
     gaussians = random_scene(20).gaussians(camera, reference_backend())

@@ -6,14 +6,7 @@ import math
 import pytest
 import torch
 
-from structgstream.kernels.reference_losses import (
-    change_bits,
-    excess,
-    l1_ssim,
-    neighbour_difference,
-    ssim_map,
-    volume,
-)
+from structgstream.kernels.reference_losses import change_bits, excess, l1_ssim, neighbour_difference, ssim_map, volume
 from tests.support.published import published_ssim
 
 

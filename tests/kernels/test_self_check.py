@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from structgstream.kernels.backend import cpu_backend, reference_backend
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.self_check import disagreement
 from structgstream.kernels.values import RasterOutput
+from tests.support.backends import needs_native
 
 ORACLE = reference_backend().rasterize
 HERE = torch.device("cpu")
 
 
-@pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+@needs_native
 def test_the_processors_kernels_agree_with_the_reference() -> None:
     assert disagreement(cpu_backend().rasterize, ORACLE, HERE) is None
 

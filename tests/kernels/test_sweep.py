@@ -1,24 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sweep along rays, where it is known what emerged; each back-end on its own."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
-import pytest
 import torch
 
-from structgstream.kernels import cpu_motion, reference_motion
-from structgstream.kernels.native import native_reason
-from structgstream.kernels.values import SweepView, Swept
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import SweepView
+from tests.support.backends import on_each_backend
 from tests.support.rigs import arc_rig
 
-needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
-SWEEPERS = [
-    pytest.param(reference_motion.sweep, id="reference"),
-    pytest.param(cpu_motion.sweep, id="cpu", marks=needs_native),
-]
+RULES = {"planes": 65, "max_contradictions": 0.34}
 
 
-def emerged(planes: int = 65) -> tuple[list[SweepView], torch.Tensor, torch.Tensor]:
+def emerged() -> tuple[list[SweepView], torch.Tensor, torch.Tensor]:
     """A red disc of radius 0.25 in front of a grey wall has emerged at the origin, as four cameras see it."""
     rig, found = arc_rig(5, width=64, height=48), []
     for name in rig.training:
@@ -35,29 +31,29 @@ def emerged(planes: int = 65) -> tuple[list[SweepView], torch.Tensor, torch.Tens
     return found, torch.tensor([[u, v]]), torch.tensor([6.0])
 
 
-@pytest.mark.parametrize("sweep", SWEEPERS)
-def test_what_emerged_is_found_where_it_is(sweep) -> None:
-    scene, pixel, farthest = emerged()
-    found: Swept = sweep(scene, 1, pixel, farthest, planes=65, min_supports=2, max_contradictions=0.34)
+@on_each_backend
+def test_what_emerged_is_found_where_it_is(build: Callable[[], Backend]) -> None:
+    scene, *ray = emerged()
+    found = build().sweep(scene, 1, *ray, **RULES, min_supports=2)
     center = float(scene[1].viewmat[2, 3])
     # Any depth at which the ray stays within the disc's image in all views is as good; the middle of them is taken.
     assert abs(float(found.depths) - center) < 0.15
     assert float(found.costs) < 0.03
 
 
-@pytest.mark.parametrize("sweep", SWEEPERS)
-def test_one_view_alone_is_contradicted(sweep) -> None:
-    scene, pixel, farthest = emerged()
+@on_each_backend
+def test_one_view_alone_is_contradicted(build: Callable[[], Backend]) -> None:
+    scene, *ray = emerged()
     alone = [v if i == 1 else replace(v, missing=torch.zeros_like(v.missing)) for i, v in enumerate(scene)]
-    found: Swept = sweep(alone, 1, pixel, farthest, planes=65, min_supports=1, max_contradictions=0.34)
+    found = build().sweep(alone, 1, *ray, **RULES, min_supports=1)
     assert float(found.depths) == 0.0
     assert torch.isinf(found.costs).all()
 
 
-@pytest.mark.parametrize("sweep", SWEEPERS)
-def test_what_is_hidden_has_no_vote(sweep) -> None:
+@on_each_backend
+def test_what_is_hidden_has_no_vote(build: Callable[[], Backend]) -> None:
     """Behind what is rendered nothing can emerge: with a wall before the disc no point is supported."""
-    scene, pixel, _ = emerged()
+    scene, *ray = emerged()
     walled = [replace(v, depths=torch.full_like(v.depths, 1.5)) for v in scene]
-    found: Swept = sweep(walled, 1, pixel, torch.tensor([6.0]), planes=65, min_supports=2, max_contradictions=0.34)
+    found = build().sweep(walled, 1, *ray, **RULES, min_supports=2)
     assert float(found.depths) < 1.7  # before the wall, or nowhere

@@ -4,13 +4,15 @@
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
-from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.cuda_library import KernelLibrary, kernel_library
 from structgstream.kernels.native import ISA_NAMES, native_library, native_reason
 from tests.support.shared_folder import made_once
 
@@ -39,6 +41,24 @@ def using_isa(isa: int) -> Iterator[None]:
         library.sgs_use_isa(len(ISA_NAMES))
 
 
+def check_any_threads(run: Callable[[], Iterable[Tensor]], counts: Sequence[int] = (1, 2, 3)) -> None:
+    """``run`` finds the same bits with any number of threads; tests/conftest.py restores that."""
+    found = []
+    for count in counts:
+        torch.set_num_threads(count)
+        found.append([*run()])
+    assert all(torch.equal(one, other) for again in found[1:] for one, other in zip(found[0], again, strict=True))
+
+
+def in_both_orders(
+    emulation: Callable[[int], KernelLibrary], run: Callable[[KernelLibrary], Iterable[Tensor]]
+) -> list[Tensor]:
+    """What ``run`` finds, after a check that the order of threads and blocks does not matter."""
+    found, again = ([*run(emulation(order))] for order in (0, 1))
+    assert all(torch.equal(one, other) for one, other in zip(found, again, strict=True))
+    return found
+
+
 @pytest.fixture(scope="session")
 def emulation() -> Callable[[int], KernelLibrary]:
     """The interface of the CUDA kernels on the processor; the argument says in which order threads run (0 or 1)."""
@@ -57,10 +77,6 @@ def kernels_on(request: pytest.FixtureRequest) -> Callable[[str], KernelLibrary]
     """The CUDA kernels of a device type: their emulation for ``cpu``."""
 
     def kernels(device_type: str) -> KernelLibrary:
-        if device_type == "cpu":
-            return request.getfixturevalue("emulation")(0)
-        from structgstream.kernels.cuda_library import kernel_library
-
-        return kernel_library()
+        return request.getfixturevalue("emulation")(0) if device_type == "cpu" else kernel_library()
 
     return kernels

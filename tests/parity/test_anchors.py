@@ -7,11 +7,12 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
+from tests.parity.conftest import check_any_threads
+from tests.support.backends import needs_native
 from tests.support.splats import viewport_of
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 
 # Positions of the tensors that online training moves: x_v, l_v, the covariance head.
 ONLINE = {0, 1, 13, 14, 15, 16}
@@ -135,13 +136,12 @@ def test_attributes_that_no_loss_uses(used: tuple[int, ...]) -> None:
 def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     values, visible = tensors(3000, 5, distance_input=True), torch.arange(0, 3000, 2)
     cotangents = cotangents_of(values, visible, True)
-    results = []
-    for threads in (1, 2, 3, 2):
-        torch.set_num_threads(threads)
+
+    def results() -> list[Tensor]:
         gaussians, gradients = run(cpu_anchors, values, visible, True, cotangents)
-        results.append([*attributes(gaussians), gaussians.gaussians.ids, gaussians.raw_opacities, *gradients.values()])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+        return [*attributes(gaussians), gaussians.gaussians.ids, gaussians.raw_opacities, *gradients.values()]
+
+    check_any_threads(results, (1, 2, 3, 2))
 
 
 def test_no_visible_anchor() -> None:

@@ -15,14 +15,12 @@ from torch import Tensor
 from structgstream.kernels import cpu_fit, cuda_fit
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import FitFrame
 from structgstream.scene.state import state_of
-from structgstream.training.online.config import SmoothnessConfig
-from structgstream.training.parameters import RoundingConfig
-from tests.parity.test_native_iterations import fitted, scene_of, start_of
+from tests.parity.test_native_iterations import PLAIN, check_same_results, fitted
+from tests.support.backends import needs_native
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 Emulation = Callable[[int], KernelLibrary]
 
 
@@ -77,22 +75,9 @@ def test_pictures_and_gradients_are_those_of_the_cpu(emulation: Emulation, optio
     assert len(seen) == 6
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"smoothness": SmoothnessConfig(), "mean_of_last": 0.0, "rounding": RoundingConfig(rate_weight=0.0)}],
-)
+@pytest.mark.parametrize("changes", [{}, PLAIN])
 def test_results_are_those_of_the_cpu(emulation: Emulation, changes: dict[str, Any]) -> None:
-    one, two = fitted(emulated(emulation), **changes), fitted(cpu_backend(), **changes)
-    start = state_of(start_of(scene_of(appears=True, free=9)).scene)
-    before, after = state_of(one.scene), state_of(two.scene)
-    assert one.pruned == two.pruned == 3
-    for name, value in before.items():
-        apart = (value - after[name]).float().norm()
-        moved = (value - start[name][-len(value) :]).float().norm()
-        # Adam steps by as much where a gradient is nearly zero.
-        assert apart <= 1e-2 * moved + 1e-6 * value.float().norm(), (name, float(apart), float(moved))
-    assert one.train_psnr == pytest.approx(two.train_psnr, abs=1e-3)
-    assert one.losses == pytest.approx(two.losses, rel=1e-4)
+    check_same_results(fitted(emulated(emulation), **changes), fitted(cpu_backend(), **changes))
 
 
 def test_results_depend_neither_on_the_order_of_threads_nor_on_room(emulation: Emulation) -> None:

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.scene.render import render_picture
 from structgstream.scene.scene import Scene
 from structgstream.session.presets import COMPACT
@@ -19,11 +18,12 @@ from structgstream.training.online.preprocess import preprocess
 from structgstream.training.residuals import residual_floor
 from structgstream.training.result import FitResult
 from structgstream.training.views import training_views
+from tests.support.backends import needs_native
 from tests.support.counted_gpu import Counts, counted_gpu
 from tests.support.pretended_gpu import DEVICE, moved
 from tests.support.worlds import moving_world
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 
 MAX_OPERATIONS = {(4, False): 1_050, (27, False): 1_185, (4, True): 1_190, (27, True): 1_340}
 """By number of views, and whether much moves fast, so that there is a second round of flow: what the frame below takes

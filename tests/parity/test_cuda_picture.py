@@ -13,14 +13,15 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels import cuda_anchors, cuda_picture, reference_raster
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import RasterOutput, TileSelection, tile_grid
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
+from tests.parity.conftest import in_both_orders
+from tests.support.backends import needs_native
 from tests.support.rigs import random_scene
 from tests.support.worlds import moving_world
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 RIG = moving_world(2).rig
 CAMERAS = [RIG[name] for name in RIG.training]
 VIEWPORTS = [camera.viewport(torch.zeros(0)) for camera in CAMERAS]
@@ -36,15 +37,6 @@ def selections(seed: int) -> list[TileSelection]:
     generator = torch.Generator().manual_seed(seed)
     masks = torch.rand(len(CAMERAS), *tile_grid(SIZE[1], SIZE[0]), generator=generator) < 0.5
     return [TileSelection(mask, SIZE[1], SIZE[0]) for mask in masks]
-
-
-def in_both_orders(
-    emulation: Callable[[int], KernelLibrary], run: Callable[[KernelLibrary], list[Tensor]]
-) -> list[Tensor]:
-    """What ``run`` finds, after a check that the order of threads does not matter."""
-    found, again = (run(emulation(order)) for order in (0, 1))
-    assert all(torch.equal(one, two) for one, two in zip(found, again, strict=True))
-    return found
 
 
 @pytest.mark.parametrize("channels", [1, 7, 9])

@@ -3,7 +3,7 @@
 processor, with threads and blocks in both orders, and on a GPU where there is one.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -15,8 +15,8 @@ from structgstream.cameras import Camera
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_raster, cuda_picture, reference_raster
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection
+from tests.parity.conftest import in_both_orders
 from tests.parity.test_raster import (
     COLOURED,
     HEIGHT,
@@ -33,11 +33,11 @@ from tests.parity.test_raster import (
     run_tiles,
     some_tiles,
 )
+from tests.support.backends import needs_native
 from tests.support.splats import splats_of
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
-EVERYWHERE = torch.ones(HEIGHT, WIDTH)
 Emulation = Callable[[int], KernelLibrary]
 
 
@@ -56,17 +56,6 @@ def scene(name: str) -> list[Tensor]:
     return values
 
 
-def in_both_orders(emulation: Emulation, inputs: Sequence[Tensor], **options: Tensor | None) -> list[Tensor]:
-    """Picture, coverage, radii and gradients, after a check that the order of threads does not matter."""
-    results = []
-    for order in (0, 1):
-        rasterize = partial(cuda_picture.rasterize, emulation(order))
-        image, alpha, gradients, radii = run(rasterize, tuple(inputs), away=EVERYWHERE, **options)
-        results.append([image, alpha, radii, *gradients])
-    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
-    return results[0]
-
-
 @pytest.mark.parametrize("name", ["plain", "dark", "needles", "walls", "moved"])
 @pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
 @pytest.mark.parametrize("share", [None, 0.4])
@@ -75,11 +64,14 @@ def test_pictures_and_gradients_are_those_of_the_cpu(
 ) -> None:
     inputs = scene(name)
     intervals = None if share is None else intervals_at(share)[:1].expand(len(inputs[0]))
-    options = {"background": background, "intervals": intervals}
-    image, alpha, radii, *gradients = in_both_orders(emulation, inputs, **options)
-    exact, exact_alpha, exact_gradients, exact_radii = run(
-        cpu_raster.rasterize, tuple(inputs), away=EVERYWHERE, **options
-    )
+    options = {"background": background, "intervals": intervals, "away": torch.ones(HEIGHT, WIDTH)}
+
+    def results(library: KernelLibrary) -> list[Tensor]:
+        image, alpha, gradients, radii = run(partial(cuda_picture.rasterize, library), tuple(inputs), **options)
+        return [image, alpha, radii, *gradients]
+
+    image, alpha, radii, *gradients = in_both_orders(emulation, results)
+    exact, exact_alpha, exact_gradients, exact_radii = run(cpu_raster.rasterize, tuple(inputs), **options)
     # In pixels where an alpha is at a limit, the last bit decides. Conics of needles have large roundings.
     apart = torch.maximum((image - exact).abs().amax(-1), (alpha - exact_alpha).abs())
     assert (apart < (3e-5 if name == "needles" else 1e-6)).float().mean() > 0.999

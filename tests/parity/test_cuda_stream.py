@@ -11,9 +11,9 @@ import torch
 import structgstream
 from structgstream.kernels.backend import cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.self_check import disagreement
 from structgstream.session.presets import PRESETS
+from tests.support.backends import needs_native
 from tests.support.counted_gpu import counted_gpu
 from tests.support.pretended_gpu import DEVICE, pretended_device
 from tests.support.small_clip import small_clip_path
@@ -22,7 +22,7 @@ from tests.support.small_presets import FEW_POINTS
 FRAMES, SCALE = 2, 0.25
 
 
-@pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+@needs_native
 @pytest.mark.parametrize("preset", ["compact", "paper-n3dv"])
 def test_a_stream_on_another_device(
     preset: str, emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -49,7 +49,7 @@ def test_a_stream_on_another_device(
     assert 10.0 < found.mean.psnr < 40.0
 
 
-@pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+@needs_native
 def test_the_check_before_use_passes(
     emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flow lifted to displacements: each back-end against the oracle."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from types import SimpleNamespace
 
@@ -10,10 +10,9 @@ import torch
 
 from structgstream.kernels import cpu_motion, cuda, reference_motion
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Lifted, Neighbors, ViewFlows
-
-needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+from tests.parity.conftest import check_any_threads, in_both_orders
+from tests.support.backends import needs_native
 
 
 def scenery(
@@ -82,24 +81,17 @@ def test_cpu_finds_what_the_oracle_finds(isa: int, seed: int, speed: float) -> N
 @pytest.mark.parametrize(("seed", "speed"), [(0, 1.0), (2, 8.0)])
 def test_a_gpu_finds_what_the_oracle_finds(emulation: Callable[[int], KernelLibrary], seed: int, speed: float) -> None:
     given = scenery(seed, speed=speed)
-    found, again = (lifted(SimpleNamespace(lift=partial(cuda.lift, emulation(n))), single(given)) for n in (0, 1))
-    assert torch.equal(found.displacements, again.displacements)
-    compare(found, given)
+
+    def run(library: KernelLibrary) -> Iterable[torch.Tensor]:
+        return vars(lifted(SimpleNamespace(lift=partial(cuda.lift, library)), single(given))).values()
+
+    compare(Lifted(*in_both_orders(emulation, run)), given)
 
 
 @needs_native
 def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
-    given, threads = single(scenery(3, targets=200)), torch.get_num_threads()
-    try:
-        results = []
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            results.append(lifted(cpu_motion, given))
-    finally:
-        torch.set_num_threads(threads)
-    for other in results[1:]:
-        assert torch.equal(results[0].displacements, other.displacements)
-        assert torch.equal(results[0].inlier_share, other.inlier_share)
+    given = single(scenery(3, targets=200))
+    check_any_threads(lambda: vars(lifted(cpu_motion, given)).values())
 
 
 @needs_native

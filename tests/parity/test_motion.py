@@ -6,10 +6,10 @@ import torch
 
 from structgstream.flow import ABSOLUTE, RELATIVE
 from structgstream.kernels import cpu_motion, reference_motion
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.support.backends import needs_native
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (37, 53), (64, 80)])

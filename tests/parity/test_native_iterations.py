@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The iterations of a later frame in C++ beside the loop in torch over the same kernels and over the reference's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 import torch
+from torch import Tensor
 
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.sampling import RigSampling
@@ -27,11 +27,13 @@ from structgstream.training.online.optimize import FrameOptimizer
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.result import FitResult, Step, Stopwatch
-from structgstream.training.views import View, blackened, training_views
+from structgstream.training.views import View, blackened
+from tests.parity.conftest import check_any_threads
+from tests.support.backends import needs_native
 from tests.support.rigs import random_scene
 from tests.support.worlds import moving_world
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 WORLD = moving_world(2)
 CONFIG = OnlineConfig(
     iterations=11,
@@ -45,12 +47,9 @@ CONFIG = OnlineConfig(
     mean_of_last=0.7,
     rounding=RoundingConfig(free_priced=True),
 )
-STEPS = {
-    "anchor_positions": 0.01,
-    "appearance": 1 / 16,
-    "free_means": 0.01,
-    "free_colors": 1 / 128,
-}
+STEPS = {"anchor_positions": 0.01, "appearance": 1 / 16, "free_means": 0.01, "free_colors": 1 / 128}
+PLAIN = {"smoothness": SmoothnessConfig(), "mean_of_last": 0.0, "rounding": RoundingConfig(rate_weight=0.0)}
+"""Without smoothness, mean of steps and rate term."""
 
 
 def scene_of(*, appears: bool, free: int) -> Scene:
@@ -70,7 +69,7 @@ def tiles_of(views: list[View], *, first: int, last: int) -> TileSelection:
 
 
 def start_of(scene: Scene) -> StartingPoint:
-    views = training_views(WORLD.frames[1], WORLD.rig, torch.device("cpu"))
+    views = WORLD.views(1)
     counts = torch.ones(views[1].image.shape[:2], dtype=torch.bool)
     counts[5:19, 10:30] = False
     views[1] = replace(views[1], image=blackened(views[1].image, counts), mask=counts)
@@ -143,12 +142,12 @@ def test_settings_and_rows_that_they_do_not_know_are_found(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("oracle", [cpu_backend, reference_backend])
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"smoothness": SmoothnessConfig(), "mean_of_last": 0.0, "rounding": RoundingConfig(rate_weight=0.0)}],
-)
+@pytest.mark.parametrize("changes", [{}, PLAIN])
 def test_results_are_those_of_the_loop(oracle: Callable[[], Backend], changes: dict[str, Any]) -> None:
-    one, two = fitted(cpu_backend(), **changes), fitted(in_torch(oracle()), **changes)
+    check_same_results(fitted(cpu_backend(), **changes), fitted(in_torch(oracle()), **changes))
+
+
+def check_same_results(one: FitResult[Scene], two: FitResult[Scene]) -> None:
     start = state_of(start_of(scene_of(appears=True, free=9)).scene)
     before, after = state_of(one.scene), state_of(two.scene)
     assert one.pruned == two.pruned == 3
@@ -163,15 +162,13 @@ def test_results_are_those_of_the_loop(oracle: Callable[[], Backend], changes: d
 
 
 def test_results_do_not_depend_on_threads_nor_on_reports() -> None:
-    threads, reported = torch.get_num_threads(), list[Step]()
-    try:
-        found = []
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            found.append(state_of(fitted(cpu_backend(), reported=reported if number == 3 else None).scene))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(value, other[name]) for other in found[1:] for name, value in found[0].items())
+    reported = list[Step]()
+
+    def results() -> Iterable[Tensor]:
+        reports = reported if torch.get_num_threads() == 3 else None
+        return state_of(fitted(cpu_backend(), reported=reports).scene).values()
+
+    check_any_threads(results)
     assert [step.iteration for step in reported] == [4, 9]
     assert {step.anchors for step in reported} == {40}
 

@@ -7,9 +7,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from structgstream.kernels import cpu_motion, reference_motion
-from structgstream.kernels.native import native_reason
+from tests.support.backends import needs_native
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 HEIGHT, WIDTH = 37, 53  # No multiple of any vector.
 
 

@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Viewport
+from structgstream.errors import BackendError
 from structgstream.kernels import cpu_raster, reference_raster
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.reference_raster import rasterize as reference
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.parity.conftest import check_any_threads
+from tests.support.backends import needs_native
 from tests.support.splats import splats_of, viewport_of
 
-native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.
 COLOURED = torch.tensor([0.3, 0.6, 0.1])
 NAMES = ("means", "quats", "scales", "opacities", "colors", "screen_offsets")
@@ -147,7 +148,7 @@ def check_against_reference(
         assert errors.quantile(0.95) < max(2e-4, 3 * autograd.quantile(0.95)), name
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
 def test_cpu(isa: int, background: Tensor | None) -> None:
     check_against_reference(cpu_raster.rasterize, background=background)
@@ -161,7 +162,7 @@ def intervals_at(share: float) -> Tensor:
     return share * around * depths / (view.K[0, 0] * view.K[1, 1]).sqrt()
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 3.0])
 def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float) -> None:
     """Pictures without training pixels, much smaller than the training pictures, as large, and three times as large."""
@@ -176,7 +177,7 @@ def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float
     assert (plain - filtered).abs().max() > 0.01
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("rasterize", [reference, cpu_raster.rasterize], ids=["reference", "cpu"])
 def test_what_hardly_any_light_reaches_is_drawn_without_gradient(isa: int, rasterize) -> None:
     """The first of three walls lets a thousandth of the light through."""
@@ -194,7 +195,7 @@ def test_what_hardly_any_light_reaches_is_drawn_without_gradient(isa: int, raste
         assert not gradient[1:].any(), name
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("faint", [False, True])
 def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
     """Blocks of pixels are chosen by a splat's ellipse: needles at every angle touch the corners of most."""
@@ -211,16 +212,15 @@ def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
     assert (drawn - image).abs()[away].max() < 1e-3
 
 
-@native
+@needs_native
 def test_repeated_runs_and_thread_counts_give_the_same_bits(isa: int) -> None:
     inputs = tuple(v.float() for v in gaussians(2000))
-    results = []
-    for threads in (1, 2, 2, 3):
-        torch.set_num_threads(threads)
+
+    def results() -> list[Tensor]:
         image, alpha, gradients, radii = run(cpu_raster.rasterize, inputs, away=torch.ones(HEIGHT, WIDTH))
-        results.append([image, alpha, *gradients, radii])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+        return [image, alpha, *gradients, radii]
+
+    check_any_threads(results, (1, 2, 2, 3))
 
 
 def check_nothing_broken_or_hidden_is_drawn(rasterize) -> None:
@@ -241,12 +241,12 @@ def check_nothing_broken_or_hidden_is_drawn(rasterize) -> None:
     assert all(torch.isfinite(gradient).all() and not gradient[:5].any() for gradient in gradients)
 
 
-@native
+@needs_native
 def test_nothing_broken_or_hidden_is_drawn(isa: int) -> None:
     check_nothing_broken_or_hidden_is_drawn(cpu_raster.rasterize)
 
 
-@native
+@needs_native
 def test_a_gaussian_larger_than_the_picture(isa: int) -> None:
     inputs = [v[:1].float().clone() for v in gaussians()]
     inputs[0][:] = torch.tensor([[0.0, 0.0, 2.0]])
@@ -268,14 +268,12 @@ def check_that_memory_is_freed_without_a_backward_pass(rasterize) -> None:
     assert peaks[2] - peaks[0] < 20_000  # kB; 80 pictures that leaked would hold more than 40,000
 
 
-@native
+@needs_native
 def test_memory_is_freed_without_a_backward_pass() -> None:
     check_that_memory_is_freed_without_a_backward_pass(cpu_raster.rasterize)
 
 
 def test_another_precision_is_refused_with_a_way_out() -> None:
-    from structgstream.errors import BackendError
-
     with pytest.raises(BackendError, match="reference back-end"):
         cpu_raster.rasterize(splats_of(*gaussians(3)[:5]), camera())
 
@@ -300,7 +298,7 @@ def run_tiles(
     return output, gradients
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("trained", [None, 120])
 def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained: int | None) -> None:
     inputs = gaussians()
@@ -327,7 +325,7 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
             assert not theirs[trained:].any(), name
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights(isa: int, channels: int) -> None:
     inputs = gaussians()
@@ -342,24 +340,16 @@ def test_blending_weights(isa: int, channels: int) -> None:
     assert ((ours - again).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> None:
     splats = splats_of(*(value.float() for value in gaussians(2000)[:5]))
     maps = torch.rand(HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(3))
-    results = []
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 2, 2):
-            torch.set_num_threads(threads)
-            results.append(cpu_raster.blending_weights(splats, camera(torch.float32), maps))
-    finally:
-        torch.set_num_threads(before)
-    assert results[0].any()
-    assert all(torch.equal(results[0], other) for other in results[1:])
+    assert cpu_raster.blending_weights(splats, camera(torch.float32), maps).any()
+    check_any_threads(lambda: [cpu_raster.blending_weights(splats, camera(torch.float32), maps)], (1, 2, 2))
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 6, 7, 8, 9])
 @pytest.mark.parametrize("background", [None, torch.tensor([0.2, 0.5, 0.9])])
 def test_a_picture_with_weights_is_both(isa: int, channels: int, background: Tensor | None) -> None:
@@ -371,7 +361,7 @@ def test_a_picture_with_weights_is_both(isa: int, channels: int, background: Ten
     assert torch.equal(weights, cpu_raster.blending_weights(splats, camera(torch.float32), maps))
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("intervals", [None, torch.full((300,), 0.02)])
 def test_radii_are_those_of_a_drawing(isa: int, intervals: Tensor | None) -> None:
     splats = replace(splats_of(*(value.float() for value in gaussians()[:5])), sampling_intervals=intervals)
@@ -381,7 +371,7 @@ def test_radii_are_those_of_a_drawing(isa: int, intervals: Tensor | None) -> Non
         assert torch.equal(radii, module.rasterize(splats, camera(torch.float32)).radii)
 
 
-@native
+@needs_native
 @pytest.mark.parametrize("channels", [1, 3, 8, 9])
 def test_what_maps_leave_out_changes_no_weight(isa: int, channels: int) -> None:
     """Blocks and tiles in which all maps are zero are passed over; with the picture they are not."""
@@ -397,7 +387,7 @@ def test_what_maps_leave_out_changes_no_weight(isa: int, channels: int) -> None:
     assert not cpu_raster.blending_weights(splats, camera(torch.float32), torch.zeros_like(maps)).any()
 
 
-@native
+@needs_native
 def test_blending_weights_of_nothing(isa: int) -> None:
     nothing = splats_of(*(value[:0].float() for value in gaussians()[:5]))
     maps = torch.ones(HEIGHT, WIDTH, 5)

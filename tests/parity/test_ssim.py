@@ -17,7 +17,7 @@ from structgstream.kernels import cpu_losses, cuda, reference_losses
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import ISA_NAMES
 from structgstream.kernels.values import TileSelection, tile_grid
-from tests.parity.conftest import using_isa
+from tests.parity.conftest import check_any_threads, in_both_orders, using_isa
 
 Loss = Callable[..., tuple[Tensor, Tensor]]
 
@@ -138,22 +138,13 @@ def test_a_picture_that_is_not_contiguous_gives_the_same_bits(loss: Loss) -> Non
 @pytest.mark.parametrize("tiled", [False, True])
 def test_bitwise_equal_for_any_number_of_threads(isa: int, tiled: bool) -> None:
     image, target = pictures(90, 320)
-    tiles, results = some_tiles(90, 320) if tiled else None, []
-    for threads in (1, 2, 3, 2):
-        torch.set_num_threads(threads)
-        results.append(value_and_gradient(cpu_losses.l1_ssim, image, target, (0.8, -0.2), tiles=tiles))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    given, tiles = (image, target, (0.8, -0.2)), some_tiles(90, 320) if tiled else None
+    check_any_threads(lambda: value_and_gradient(cpu_losses.l1_ssim, *given, tiles=tiles), (1, 2, 3, 2))
 
 
 def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], KernelLibrary]) -> None:
-    image, target = pictures(45, 120)
-    tiles = some_tiles(45, 120)
-    forth, back = (
-        value_and_gradient(partial(cuda.l1_ssim, emulation(order)), image, target, (0.8, -0.2), tiles=tiles)
-        for order in (0, 1)
-    )
-    assert all(torch.equal(a, b) for a, b in zip(forth, back, strict=True))
+    given, tiles = (*pictures(45, 120), (0.8, -0.2)), some_tiles(45, 120)
+    in_both_orders(emulation, lambda library: value_and_gradient(partial(cuda.l1_ssim, library), *given, tiles=tiles))
 
 
 def test_what_it_cannot_compare(loss: Loss) -> None:

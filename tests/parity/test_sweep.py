@@ -10,11 +10,10 @@ import torch
 
 from structgstream.kernels import cpu_motion, cuda, reference_motion
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import SweepView, Swept
+from tests.parity.conftest import check_any_threads, in_both_orders
+from tests.support.backends import needs_native
 from tests.support.rigs import arc_rig
-
-needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
 
 def views(seed: int, dtype: torch.dtype) -> list[SweepView]:
@@ -87,19 +86,10 @@ def test_it_finds_what_the_oracle_finds(sweep: Callable[..., Swept], seed: int) 
 
 @needs_native
 def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
-    threads, results = torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            results.append(cpu_motion.sweep(views(3, torch.float32), 0, *rays(3, torch.float32), **RULES))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(results[0].depths, results[1].depths)
-    assert torch.equal(results[0].costs, results[1].costs)
+    given = views(3, torch.float32), 0, *rays(3, torch.float32)
+    check_any_threads(lambda: vars(cpu_motion.sweep(*given, **RULES)).values(), (1, 3))
 
 
 def test_the_cuda_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> None:
     given = views(4, torch.float32), 2, *rays(4, torch.float32)
-    one, other = (cuda.sweep(emulation(order), *given, **RULES) for order in (0, 1))
-    assert torch.equal(one.depths, other.depths)
-    assert torch.equal(one.costs, other.costs)
+    in_both_orders(emulation, lambda library: vars(cuda.sweep(library, *given, **RULES)).values())

@@ -8,13 +8,7 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.session.presets import (
-    PRESETS,
-    StreamConfig,
-    completed,
-    from_json,
-    to_json,
-)
+from structgstream.session.presets import PRESETS, StreamConfig, completed, from_json, to_json
 from structgstream.training.frame0.fit import InitialRates
 
 

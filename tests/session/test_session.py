@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import errno
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.memory_captures import MemoryCapture
+from tests.support.sessions import resume_in
 from tests.support.small_presets import TINY_RIG
 from tests.support.streams import moved, same, small_scene
 from tests.support.worlds import moving_world
@@ -99,9 +101,8 @@ def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkey
         """A trainer that touches a static field, which no packet carries."""
         started_from.append(scene)
         fitted = moved(scene, frame.index)
-        return FitResult(
-            replace(fitted, anchors=replace(fitted.anchors, features=fitted.anchors.features + 1)), 1, 21.0
-        )
+        anchors = replace(fitted.anchors, features=fitted.anchors.features + 1)
+        return FitResult(replace(fitted, anchors=anchors), 1, 21.0)
 
     monkeypatch.setattr(method, "fit_next_frame", following)
     sink = MemorySink()
@@ -116,20 +117,17 @@ def test_every_frame_has_a_seed_of_its_own(quick_fits: list[int]) -> None:
     assert frame_seed(2, 7) == 2_000_013
 
 
+def in_unit_range(source: MemoryCapture) -> list[MultiViewFrame]:
+    return [replace(frame, images={n: i / 255 for n, i in frame.images.items()}) for frame in source.pictures]
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
         ({"fps": -30.0}, "Frames a second must be positive, got -30"),
         ({"points": np.zeros((60, 6))}, r"points of world have shape \(60, 6\); expected \[P, 3\]"),
         ({"pictures": capture().pictures[1:]}, "world gives frame 1 where frame 0 belongs"),
-        (
-            {
-                "pictures": [
-                    replace(frame, images={n: i / 255 for n, i in frame.images.items()}) for frame in capture().pictures
-                ]
-            },
-            "float64 .*; expected a numpy array of uint8",
-        ),
+        ({"pictures": in_unit_range(capture())}, "float64 .*; expected a numpy array of uint8"),
     ],
     ids=["rate", "points", "numbers", "pictures"],
 )
@@ -249,17 +247,8 @@ def test_a_failure_in_the_first_frame_leaves_the_old_file(
 def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[int]) -> None:
     header = StreamReader(uninterrupted()).header
     assert header.metadata.keys() == {"capture"}
-    assert header.config.keys() == {
-        "denoising",
-        "environment",
-        "initial",
-        "online",
-        "points",
-        "key_interval_seconds",
-        "rate",
-        "codec",
-        "seed",
-    }
+    names = {"denoising", "environment", "initial", "online", "points", "key_interval_seconds", "rate", "codec", "seed"}
+    assert header.config.keys() == names
 
 
 def test_the_real_fit_resumes_exactly_and_keeps_static_fields(tmp_path: Path) -> None:
@@ -280,7 +269,5 @@ def test_the_real_fit_resumes_exactly_and_keeps_static_fields(tmp_path: Path) ->
     assert not torch.equal(states[0]["anchor_positions"], states[2]["anchor_positions"])
     path = tmp_path / "a.sgs"
     for cut in (reader.packets[1].offset, reader.packets[2].offset + 99):
-        path.write_bytes(whole.data[:cut])
-        sink, resumed = FileSink.resume(path)
-        run(source, sink, resumed=resumed, config=config)
+        resume_in(path, whole.data[:cut], partial(run, source, config=config))
         assert path.read_bytes() == whole.data

@@ -26,27 +26,20 @@ from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
-from structgstream.session.loop import Session
 from structgstream.session.presets import PRESETS, StreamConfig
-from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
+from tests.support.sessions import run_session
 from tests.support.small_presets import TINY_RIG
 from tests.support.varied import varied
 from tests.support.worlds import World, moving_world
 
 COMPACT = PRESETS["compact"]
+INITIAL = replace(TINY_RIG.initial, camera_color=True, voxel_size=0.05)
 CONFIG = replace(
     COMPACT,
-    initial=replace(
-        TINY_RIG.initial,
-        iterations=40,
-        schedule_iterations=40,
-        coarse_iterations=20,
-        camera_color=True,
-        voxel_size=0.05,
-    ),
+    initial=replace(INITIAL, iterations=40, schedule_iterations=40, coarse_iterations=20),
     online=replace(
         COMPACT.online,
         iterations=8,
@@ -75,7 +68,7 @@ def capture(world: World, lacking: Mapping[int, str | tuple[str, ...]]) -> Memor
 
 def run(source: FrameSource, path: Path, *, config: StreamConfig = CONFIG, resume: bool = False) -> list[FrameReport]:
     sink, resumed = FileSink.resume(path) if resume else (FileSink(path), None)
-    return list(Session(source, sink, stream_pipeline(config), quickest_backend(), resumed=resumed).run())
+    return run_session(source, sink, config, resumed=resumed)
 
 
 def begun(whole: Path, path: Path, *, frames: int) -> Path:
@@ -201,9 +194,8 @@ def test_what_masks_leave_out_has_no_influence_on_a_single_byte(world: World, tm
 
 
 def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, plain: Path, tmp_path: Path) -> None:
-    path = plain
     lacking = capture(world, {0: "cam00", 2: "cam00"})
-    with open_stream(path) as reader:
+    with open_stream(plain) as reader:
         report = evaluate(reader, lacking, backend=quickest_backend())
     assert report.stream["absent_frames"] == {"cam00": 2}
     assert [frame.mean is None for frame in report.frames] == [True, False, True, False]
@@ -219,7 +211,7 @@ def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, plain: 
     write_plots(tmp_path / "plot.png", report, title="a")
     nowhere = capture(world, dict.fromkeys(range(4), "cam00"))
     with (
-        open_stream(path) as reader,
+        open_stream(plain) as reader,
         pytest.raises(CaptureError, match="No frame of the capture world has a picture of"),
     ):
         evaluate(reader, nowhere, backend=quickest_backend())
@@ -227,13 +219,12 @@ def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, plain: 
 
 def test_scores_are_of_the_pixels_that_count(world: World, plain: Path) -> None:
     """Noise in masked pixels changes no score, and without the mask every one."""
-    path = plain
     masks = {"cam00": np.broadcast_to(np.arange(96) >= 30, (64, 96)).copy()}
     found = []
     for garbage, with_masks in ((None, True), (1, True), (1, False)):
         source = masked(world, masks, garbage)
         source.pictures = [replace(frame, masks=masks if with_masks else {}) for frame in source.pictures]
-        with open_stream(path) as reader:
+        with open_stream(plain) as reader:
             found.append(evaluate(reader, source, backend=quickest_backend()))
     clean, noisy, whole = (
         {name: value for name, value in vars(report.mean).items() if name != "render_seconds"} for report in found

@@ -2,7 +2,7 @@
 """A stream with codec ``compact`` of a world in which everything is known."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +11,19 @@ import torch
 
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.codec.sinks import MemorySink
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import parameters_of, state_of
 from structgstream.session import struct_gstream as method
-from structgstream.session.loop import FrameReport, Session
+from structgstream.session.loop import FrameReport
 from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import RateConfig
-from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.parameters import RoundingConfig, pixel_size
-from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
+from tests.support.sessions import resume_in, run_session
 from tests.support.small_presets import TINY_RIG
 from tests.support.streams import same
 from tests.support.varied import varied
@@ -54,7 +53,7 @@ CONFIG = replace(
 
 def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
     capture = MemoryCapture(WORLD.rig, WORLD.frames[:frames], points=WORLD.scene.anchors.positions.numpy())
-    return list(Session(capture, sink, stream_pipeline(config), quickest_backend(), resumed=resumed).run())
+    return run_session(capture, sink, config, resumed=resumed)
 
 
 @cache
@@ -132,9 +131,7 @@ def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     assert [r.bytes for r in reports[:2]] == [r.bytes for r in free[:2]]
     assert reports[3].bytes < free[3].bytes
     path = tmp_path / "a.sgs"
-    path.write_bytes(sink.data[: [*scan_records(sink.data)][-3].end])
-    file, resumed = FileSink.resume(path)
-    run(file, resumed=resumed, config=config)
+    resume_in(path, sink.data[: [*scan_records(sink.data)][-3].end], partial(run, config=config))
     assert path.read_bytes() == sink.data
 
 

@@ -2,25 +2,24 @@
 """Sessions that begin other periods: by time, and where the scene is another one; resumed, the bytes are the same."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
 
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.codec.sinks import MemorySink
 from structgstream.frames import MultiViewFrame
 from structgstream.session import struct_gstream as method
-from structgstream.session.loop import FrameReport, Session
+from structgstream.session.loop import FrameReport
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.presets import StreamConfig, to_json
 from structgstream.session.rate_control import RateConfig
-from structgstream.session.struct_gstream import stream_pipeline
 from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
 from tests.session.test_session_compact import WORLD
-from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
+from tests.support.sessions import resume_in, run_session
 
 FRAMES = 8
 CHANGE = 3
@@ -50,8 +49,7 @@ def capture(length: int = FRAMES) -> MemoryCapture:
 
 
 def run(sink, config: StreamConfig, *, resumed=None, length: int = FRAMES) -> list[FrameReport]:
-    session = Session(capture(length), sink, stream_pipeline(config), quickest_backend(), resumed=resumed)
-    return list(session.run())
+    return run_session(capture(length), sink, config, resumed=resumed)
 
 
 @cache
@@ -84,15 +82,12 @@ def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None
     path = tmp_path / "a.sgs"
     cuts = (records[second].offset + 100, records[second - 1].offset, records[second + 1].end)
     for cut in cuts if case == "scheduled" else cuts[:1]:
-        path.write_bytes(data[:cut])
-        sink, resumed = FileSink.resume(path)
-        run(sink, CONFIGS[case][0], resumed=resumed)
+        resume_in(path, data[:cut], partial(run, config=CONFIGS[case][0]))
         assert path.read_bytes() == data, cut
 
 
 def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
     run(sink := MemorySink(), COMPACT_CONFIG, length=2)
-    data = sink.data
-    assert {record.period for record in scan_records(data)} == {0}
-    assert "period" not in StreamReader(data).header.config
+    assert {record.period for record in scan_records(sink.data)} == {0}
+    assert "period" not in StreamReader(sink.data).header.config

@@ -10,14 +10,13 @@ import pytest
 
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.codec.sinks import MemorySink
 from structgstream.frames import MultiViewFrame
-from structgstream.session.loop import FrameReport, Session
+from structgstream.session.loop import FrameReport
 from structgstream.session.presets import COMPACT
-from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
-from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
+from tests.support.sessions import resume_in, run_session
 from tests.support.small_presets import TINY_RIG
 from tests.support.varied import varied
 from tests.support.worlds import moving_world
@@ -39,7 +38,7 @@ CONFIG = replace(
 
 def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
     capture = MemoryCapture(WORLD.rig, pictures, points=POINTS)
-    return list(Session(capture, sink, stream_pipeline(CONFIG), quickest_backend(), resumed=resumed).run())
+    return run_session(capture, sink, CONFIG, resumed=resumed)
 
 
 @cache
@@ -61,9 +60,7 @@ def test_interrupted_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
     """What frame 0 missed, what moved last and the last pictures are all found, after frame 0 and frame 2."""
     data, path = whole()[0], tmp_path / "a.sgs"
     for number in (1, 3):
-        path.write_bytes(data[: [*scan_records(data)][number].end])
-        sink, resumed = FileSink.resume(path)
-        run(sink, resumed=resumed)
+        resume_in(path, data[: [*scan_records(data)][number].end], run)
         assert path.read_bytes() == data
 
 

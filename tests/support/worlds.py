@@ -19,7 +19,7 @@ from structgstream.training.online.measure import measure
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.online.select import DynamicSelection, select_dynamic
 from structgstream.training.residuals import ResidualFloor
-from structgstream.training.views import View
+from structgstream.training.views import View, training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
@@ -31,6 +31,14 @@ class World:
     rig: CameraRig
     scene: Scene
     frames: list[MultiViewFrame]
+
+    def views(self, frame: int = 0) -> list[View]:
+        """The training views of a frame, on the processor."""
+        return training_views(self.frames[frame], self.rig, torch.device("cpu"))
+
+    def psnr(self, scene: Scene, frame: int = 0) -> float:
+        """That of ``scene`` as the held-out camera ``cam00`` sees it, dB."""
+        return psnr(rendered(scene, self, "cam00"), self.frames[frame].images["cam00"])
 
 
 def emerging_ball(opacity: float) -> Gaussians:
@@ -97,12 +105,13 @@ def moved_since(
     before: Sequence[View],
     *,
     config: MotionConfig,
-    backend: Backend,
+    backend: Backend | None = None,
     flow_from: Collection[int] = (),
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
 ) -> DynamicSelection:
     """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
+    backend = backend or quickest_backend()
     changes = detect_changes(views, before, config=config, backend=backend, flow_from=flow_from)
     measured = measure(scene, views, changes, config=config, backend=backend, floor=floor)
     return select_dynamic(scene, measured, config=config, backend=backend, older=older)

@@ -4,7 +4,6 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.appearance import with_appearance
-from structgstream.scene.state import ParameterName
 from structgstream.training.frame0.densify import Densifier, GrowthConfig
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import ANCHOR_ROWS, Parameters
@@ -18,10 +17,9 @@ def prepared():
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
     densifier = Densifier.of(scene, config=CONFIG, iterations=1000, voxel_size=0.01)
     adam = Adam(reference_backend(), parameters.values)
-    gradients: dict[ParameterName, torch.Tensor] = {
-        name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS
-    }
-    adam.step(gradients, dict.fromkeys(ANCHOR_ROWS, 1e-9))
+    adam.step(
+        {name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS}, dict.fromkeys(ANCHOR_ROWS, 1e-9)
+    )
     return scene, parameters, densifier, adam
 
 

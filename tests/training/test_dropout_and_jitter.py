@@ -5,12 +5,7 @@ import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
-from structgstream.training.frame0.regularizers import (
-    PerturbationConfig,
-    RandomNumbers,
-    perturbation_at,
-    perturbed,
-)
+from structgstream.training.frame0.regularizers import PerturbationConfig, RandomNumbers, perturbation_at, perturbed
 from tests.support.varied import varied
 
 COUNT = 20_000

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
 from structgstream.training.online.exposure import exposure_reference, with_exposure_of
-from structgstream.training.views import View, training_views
+from structgstream.training.views import View
 from tests.support.varied import varied
 from tests.support.worlds import World, moving_world
 
@@ -22,7 +23,7 @@ WORLD = moving_world(1, cameras=6)  # Five of them train.
 def views_of(world: World, change: np.ndarray, *, only: tuple[int, ...] | None = None) -> list[View]:
     """The training views of frame 0, in the views ``only`` with colours whose biases are ``change`` ``[3]`` higher."""
     found = []
-    for view in training_views(world.frames[0], world.rig, torch.device("cpu")):
+    for view in world.views():
         colors = view.colors.clamp(1 / 255, 1 - 1 / 255)
         shifted = torch.sigmoid(torch.logit(colors) + torch.from_numpy(change).float())
         image = (shifted * 255).round().to(torch.uint8)
@@ -44,9 +45,15 @@ def on_grid(scene: Scene, step: float = 1 / 1024) -> Scene:
     return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
 
 
-def followed(scene: Scene, views: list[View], *, config: ExposureConfig = CONFIG, step: float | None = None) -> Scene:
+def followed(scene: Scene, views: list[View], *, config: ExposureConfig = CONFIG) -> Scene:
     reference = exposure_reference(WORLD.scene, views_of(WORLD, np.zeros(3)), config=config)
-    return with_exposure_of(scene, views, reference, config=config, step=step)
+    return with_exposure_of(scene, views, reference, config=config, step=None)
+
+
+def lit(first: Scene, scene: Scene, change: float, *, config: ExposureConfig = CONFIG, step: float = 1 / 1024) -> Scene:
+    """``scene``, of a stream that began with ``first``, in light that is ``change`` higher in all channels."""
+    reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
+    return with_exposure_of(scene, views_of(WORLD, np.full(3, change)), reference, config=config, step=step)
 
 
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 3).filter(lambda c: min(map(abs, c)) > 0.02))
@@ -67,12 +74,7 @@ def test_the_same_light_keeps_every_bit() -> None:
 def test_light_that_has_changed_is_followed_in_small_steps() -> None:
     """What is too little to begin with is followed afterwards."""
     first = on_grid(WORLD.scene)
-    config = varied(CONFIG, MIN_CHANGE=0.04, MIN_FURTHER_CHANGE=0.015)
-    reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
-
-    def light(scene: Scene, change: float, step: float = 1 / 1024) -> Scene:
-        return with_exposure_of(scene, views_of(WORLD, np.full(3, change)), reference, config=config, step=step)
-
+    light = partial(lit, first, config=varied(CONFIG, MIN_CHANGE=0.04, MIN_FURTHER_CHANGE=0.015))
     assert light(first, -0.03) is first
     dark = light(first, -0.06)
     assert light(dark, -0.066) is dark
@@ -83,25 +85,21 @@ def test_light_that_has_changed_is_followed_in_small_steps() -> None:
 
 def test_a_change_of_less_than_half_a_step_changes_nothing() -> None:
     first, config = on_grid(WORLD.scene, step=1 / 16), varied(CONFIG, MIN_CHANGE=0.005)
-    reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
-    faint = views_of(WORLD, np.full(3, -0.02))
-    assert with_exposure_of(first, faint, reference, config=config, step=1 / 1024) is not first
-    assert with_exposure_of(first, faint, reference, config=config, step=1 / 16) is first
+    assert lit(first, first, -0.02, config=config) is not first
+    assert lit(first, first, -0.02, config=config, step=1 / 16) is first
 
 
 def test_light_that_returns_to_frame_0s_returns_its_bits() -> None:
-    first, same = on_grid(WORLD.scene), views_of(WORLD, np.zeros(3))
-    reference = exposure_reference(first, same, config=CONFIG)
-    dark = with_exposure_of(first, views_of(WORLD, np.full(3, -0.06)), reference, config=CONFIG, step=1 / 1024)
+    first = on_grid(WORLD.scene)
+    dark = lit(first, first, -0.06)
     assert float(change_of(dark, first).max()) < -0.04
-    back = with_exposure_of(dark, same, reference, config=CONFIG, step=1 / 1024)
+    back = lit(first, dark, 0.0)
     assert torch.equal(back.mlps.color.b2, first.mlps.color.b2)
 
 
 def test_biases_lie_on_the_grid_and_nothing_else_changes() -> None:
     scene = on_grid(WORLD.scene)
-    reference = exposure_reference(scene, views_of(WORLD, np.zeros(3)), config=CONFIG)
-    found = with_exposure_of(scene, views_of(WORLD, np.full(3, 0.05)), reference, config=CONFIG, step=1 / 1024)
+    found = lit(scene, scene, 0.05)
     bins = found.mlps.color.b2 * 1024
     assert torch.equal(bins, bins.round())
     pairs = zip(found.mlps.color[:3], scene.mlps.color[:3], strict=True)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -60,14 +59,8 @@ def wall_and(floating: list[tuple[float, float, float]], *, opacity: float, view
     )
 
 
-def found(
-    scene: Scene,
-    *,
-    config: FreeSpaceConfig = CONFIG,
-    views: list[View] = VIEWS,
-    backend: Backend | None = None,
-) -> list[bool]:
-    mask = in_free_space(scene, views, config=config, backend=backend or quickest_backend())
+def found(scene: Scene, *, config: FreeSpaceConfig = CONFIG, views: list[View] = VIEWS) -> list[bool]:
+    mask = in_free_space(scene, views, config=config, backend=quickest_backend())
     wall = 25 * 33
     assert not mask[:wall].any(), "no surface is in free space"
     return mask[wall:].tolist()
@@ -107,15 +100,7 @@ def test_too_few_cameras_judge_nothing() -> None:
 
 def test_where_nothing_is_drawn_nothing_is_in_front_of_it() -> None:
     scene = wall_and(FLOATING, opacity=-0.5)
-    rows = torch.arange(25 * 33, len(scene.anchors))
-    anchors = scene.anchors
-    alone = AnchorCloud(
-        anchors.positions[rows],
-        anchors.log_offset_scales[rows],
-        anchors.log_base_scales[rows],
-        anchors.offsets[rows],
-        anchors.features[rows],
-    )
+    alone = scene.anchors.select(torch.arange(25 * 33, len(scene.anchors)))
     mask = in_free_space(replace(scene, anchors=alone), VIEWS, config=CONFIG, backend=quickest_backend())
     assert not mask.any()
 

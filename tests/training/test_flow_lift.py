@@ -7,26 +7,20 @@ import torch
 
 from structgstream.training.online.measure import FlowEvidence
 from structgstream.training.online.scene_flow import lift_flow
-from structgstream.training.views import training_views
+from structgstream.training.views import View
 from tests.support.backends import quickest_backend
-from tests.support.worlds import World, moving_world
+from tests.support.worlds import moving_world
 
-CPU = torch.device("cpu")
 BACKEND = quickest_backend()
 
 
-def world() -> World:
-    return moving_world(2, cameras=6, width=128, height=96)
-
-
-def evidence_of(colors: torch.Tensor, flows: torch.Tensor, views: int) -> FlowEvidence:
-    return FlowEvidence(torch.full((views, len(colors)), 5.0), flows.expand(views, -1, 2), colors)
+def views_of_world() -> list[View]:
+    return moving_world(2, cameras=6, width=128, height=96).views(1)
 
 
 def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
     """A red ball beside a hand: ball and hand have flows of their own, and lie among each other."""
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
+    views = views_of_world()
     generator = torch.Generator().manual_seed(0)
     centers = 0.05 * torch.randn(40, 3, generator=generator)
     ball = torch.arange(40) < 20
@@ -34,15 +28,15 @@ def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
     # The ball moves to the right in all pictures, the hand rests.
     flows = torch.where(ball[:, None], torch.tensor([6.0, 0.0]), torch.tensor([0.0, 0.0]))
 
-    lifted = lift_flow(evidence_of(colors, flows, len(views)), centers, torch.zeros(40, 3), views, backend=BACKEND)
+    evidence = FlowEvidence(torch.full((len(views), 40), 5.0), flows.expand(len(views), -1, 2), colors)
+    lifted = lift_flow(evidence, centers, torch.zeros(40, 3), views, backend=BACKEND)
     lengths = lifted.displacements.norm(dim=1)
     assert lengths[~ball].mean() < 0.05 * lengths[ball].mean()
 
 
 def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> None:
     """Errors of a share of the width: at 640 pixels 1.2 of them, at 1920 pixels 3.6."""
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
+    views = views_of_world()
     generator = torch.Generator().manual_seed(1)
     centers, flows = 0.1 * torch.randn(60, 3, generator=generator), torch.tensor([3.0, -2.0])
     errors = torch.randn(len(views), 60, 2, generator=generator)
@@ -63,8 +57,7 @@ def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> 
 
 
 def test_without_evidence_movers_follow_their_priors() -> None:
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
+    views = views_of_world()
     nothing = FlowEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
     priors = torch.rand(4, 3)
     found = lift_flow(nothing, torch.zeros(4, 3), priors, views, backend=BACKEND)

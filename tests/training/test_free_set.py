@@ -12,22 +12,18 @@ from structgstream.training.online.config import PatchingConfig
 from structgstream.training.online.patching import IDS_PER_FRAME, FreeSet
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
-from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 BACKEND = quickest_backend()
 WORLD = moving_world(1)
+LOOK = torch.full((3, 3), 0.1).log(), torch.tensor([[0.2, 0.4, 0.6]]).repeat(3, 1)
 SCENE = replace(
     WORLD.scene,
-    free=FreeGaussians(
-        means=torch.zeros(3, 3),
-        log_scales=torch.full((3, 3), 0.1).log(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1),
+    free=replace(
+        FreeGaussians.spawned(torch.zeros(3, 3), *LOOK, opacity=0.5, first_identity=4),
         logit_opacities=torch.tensor([2.0, -9.0, 1.0]),  # The second is fainter than what survives.
-        colors=torch.tensor([[0.2, 0.4, 0.6]]).repeat(3, 1),
-        births=torch.tensor([4, 5, 6]),
     ),
 )
 SLOTS = len(SCENE.anchors) * SCENE.anchors.offsets_per_anchor
@@ -46,7 +42,7 @@ def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[FreeSet, torch.Ten
     statistics.total[SLOTS + 1] = dying_gradient
     statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
     statistics.count[SLOTS:] = 1.0
-    views = training_views(WORLD.frames[0], WORLD.rig, CPU)
+    views = WORLD.views()
     population = FreeSet(
         config=PatchingConfig(),
         template=SCENE,

@@ -12,36 +12,32 @@ from tests.support.rigs import random_scene
 VOXEL = 0.01
 
 
-DEFAULT = GrowthConfig()
-
-
-def grown(anchors, gradient, count, *, config=DEFAULT, most=10**6, seed=0):
-    return grow(
-        anchors,
-        mean_gradient=gradient,
-        count=count,
-        voxel_size=VOXEL,
-        config=config,
-        most=most,
-        generator=torch.Generator().manual_seed(seed),
-    )
-
-
 def slots(anchors) -> int:
     return len(anchors) * anchors.offsets_per_anchor
 
 
+def grown(anchors, gradient: torch.Tensor | float = 1.0, *, count: float = 100.0, most: int = 10**6):
+    """What grows where every Gaussian has this gradient, and was drawn so often."""
+    return grow(
+        anchors,
+        mean_gradient=torch.as_tensor(gradient).expand(slots(anchors)),
+        count=torch.full((slots(anchors),), count),
+        voxel_size=VOXEL,
+        config=GrowthConfig(),
+        most=most,
+        generator=torch.Generator().manual_seed(0),
+    )
+
+
 def test_nothing_grows_without_gradient_or_without_evidence() -> None:
     anchors = random_scene().anchors
-    n = slots(anchors)
-    assert len(grown(anchors, torch.zeros(n), torch.full((n,), 100.0))) == 0
-    assert len(grown(anchors, torch.ones(n), torch.full((n,), 40.0))) == 0  # 40 is not more than 40
+    assert len(grown(anchors, 0.0)) == 0
+    assert len(grown(anchors, count=40.0)) == 0  # 40 is not more than 40
 
 
 def test_new_anchors_sit_on_cells_that_were_empty() -> None:
     anchors = random_scene(60).anchors
-    n = slots(anchors)
-    new = grown(anchors, torch.ones(n), torch.full((n,), 100.0))
+    new = grown(anchors)
     sizes = [16 * VOXEL, 4 * VOXEL, VOXEL]
     assert sorted(new.cell_sizes.unique().tolist(), reverse=True) == pytest.approx(sizes)
     for cell in sizes:
@@ -55,16 +51,14 @@ def test_new_anchors_sit_on_cells_that_were_empty() -> None:
 
 def test_finer_levels_wait_for_a_coarser_one() -> None:
     anchors = random_scene(60).anchors
-    n = slots(anchors)
     # One candidate at one place: the coarse cell around it is occupied by its own anchor, so nothing follows.
     tight = replace(anchors, offsets=anchors.offsets * 1e-6)
-    assert len(grown(tight, torch.ones(n), torch.full((n,), 100.0))) == 0
+    assert len(grown(tight)) == 0
 
 
 def test_features_are_the_largest_of_the_parents() -> None:
     anchors = random_scene(200).anchors
-    n = slots(anchors)
-    new = grown(anchors, torch.ones(n), torch.full((n,), 100.0))
+    new = grown(anchors)
     assert (new.features.amax(0) <= anchors.features.amax(0)).all()
     assert torch.isfinite(new.features).all()
     parents = anchors.features.repeat_interleave(anchors.offsets_per_anchor, 0)
@@ -77,31 +71,25 @@ def test_a_new_anchor_has_the_features_of_the_one_whose_gaussians_ask_for_it() -
     far = replace(anchors, offsets=10 * anchors.offsets)
     gradient = torch.zeros(len(anchors), anchors.offsets_per_anchor)
     gradient[5] = 1.0
-    new = grown(far, gradient.flatten(), torch.full((slots(anchors),), 100.0))
+    new = grown(far, gradient.flatten())
     assert len(new) > 0
     assert (new.features == anchors.features[5]).all()
 
 
 def test_the_cap_holds() -> None:
-    anchors = random_scene(60).anchors
-    n = slots(anchors)
-    assert len(grown(anchors, torch.ones(n), torch.full((n,), 100.0), most=63)) == 3
+    assert len(grown(random_scene(60).anchors, most=63)) == 3
 
 
 def test_the_cap_keeps_the_strongest_wherever_they_lie() -> None:
     anchors = random_scene(60).anchors
-    n = slots(anchors)
-    gradient = torch.linspace(1.0, 3.0, n)  # The last anchors pull most, and no order of cells follows from it.
-    count = torch.full((n,), 100.0)
-    every = grown(anchors, gradient, count)
-    few = grown(anchors, gradient, count, most=67)
+    # The last anchors pull most, and no order of cells follows from it.
+    gradient = torch.linspace(1.0, 3.0, slots(anchors))
+    every, few = grown(anchors, gradient), grown(anchors, gradient, most=67)
     assert len(few) == 7 < len(every)
     assert few.strengths.min() >= every.strengths.sort(descending=True).values[6]
-    left = every.strengths.sort(descending=True).values[7:]
-    assert few.strengths.min() >= left.max()
     rows = [int((every.positions == position).all(1).nonzero()[0, 0]) for position in few.positions]
     assert torch.equal(every.features[rows], few.features)
-    assert len(grown(anchors, gradient, count, most=50)) == 0
+    assert len(grown(anchors, gradient, most=50)) == 0
 
 
 def test_room_for_anchors_comes_little_by_little() -> None:
@@ -121,8 +109,5 @@ def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
     for step in range(81):
         visible = torch.tensor([0, 1, 2]) if step else torch.tensor([0, 1])
         statistics.add(StructuredGaussians(none, visible, raw[: len(visible)]))
-    assert prunable_mask(statistics, GrowthConfig()).tolist() == [
-        True,
-        False,
-        False,
-    ]  # The last was seen 80 times only.
+    # The last was seen 80 times only.
+    assert prunable_mask(statistics, GrowthConfig()).tolist() == [True, False, False]

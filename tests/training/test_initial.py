@@ -9,16 +9,11 @@ from structgstream.frames import MultiViewFrame
 from structgstream.scene.state import state_of
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
-from structgstream.training.frame0.regularizers import (
-    DepthDistortionConfig,
-    FreeSpaceConfig,
-    in_free_space,
-)
+from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, in_free_space
 from structgstream.training.frame0.seeding import voxel_centers
-from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
-from tests.support.worlds import moving_world, psnr, rendered
+from tests.support.worlds import moving_world, psnr
 
 QUICK = InitialConfig(
     iterations=120,
@@ -37,9 +32,9 @@ def fit(world, *, config=QUICK, frame=None, points=None):
 
 def test_a_held_out_camera_is_reproduced() -> None:
     world = moving_world(1)
-    result = fit(world)
-    black = psnr(np.zeros_like(world.frames[0].images["cam00"]), world.frames[0].images["cam00"])
-    assert psnr(rendered(result.scene, world, "cam00"), world.frames[0].images["cam00"]) > black + 6.0
+    result, picture = fit(world), world.frames[0].images["cam00"]
+    black = psnr(np.zeros_like(picture), picture)
+    assert world.psnr(result.scene) > black + 6.0
     assert result.train_psnr > black + 8.0
     assert len(result.scene.free) == 0
 
@@ -86,16 +81,11 @@ def test_stages_of_a_fit_that_begins_late() -> None:
 
 def test_solid_surfaces() -> None:
     world = moving_world(1)
-    config = replace(
-        QUICK,
-        depth_distortion=DepthDistortionConfig(weight=0.05),
-    )
-    result = fit(world, config=config)
+    result = fit(world, config=replace(QUICK, depth_distortion=DepthDistortionConfig(weight=0.05)))
     assert result.train_psnr > 15.0
     assert result.losses["depth_distortion"] > 0.0
-    assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
-        result.grown - result.removed
-    )
+    seeds = len(voxel_centers(world.scene.anchors.positions, 0.05))
+    assert len(result.scene.anchors) == seeds + result.grown - result.removed
 
 
 def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_changes() -> None:
@@ -106,7 +96,7 @@ def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_chan
     points = torch.cat([surface, between])
     removing = replace(QUICK, floaters=varied(FreeSpaceConfig(enabled=True), MIN_CAMERAS=2, DRAWN_OPACITY=2.0))
     kept, found = fit(world, points=points), fit(world, points=points, config=removing)
-    views = training_views(world.frames[0], world.rig, torch.device("cpu"))
+    views = world.views()
     floating = in_free_space(kept.scene, views, config=removing.floaters, backend=quickest_backend())
     assert floating.any()
     assert found.counts == {"floaters": int(floating.sum())}

@@ -12,7 +12,6 @@ from structgstream.training.views import View
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
-CPU = torch.device("cpu")
 BACKEND = quickest_backend()
 
 

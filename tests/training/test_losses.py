@@ -9,28 +9,27 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.training.losses import InitialLossWeights, offset_distance, volume
 from tests.support.rigs import random_scene
 
+BACKEND = reference_backend()
+
 
 def test_volume_is_the_product_of_scales() -> None:
     scales = np.random.default_rng(0).uniform(0.1, 2.0, (11, 3))
     given, opacities = torch.from_numpy(scales), torch.full((11,), 0.1)
-    assert volume(given, opacities, reduction="sum", backend=reference_backend()).item() == pytest.approx(
-        scales.prod(1).sum()
-    )
-    assert volume(given, opacities, reduction="mean", backend=reference_backend()).item() == pytest.approx(
-        scales.prod(1).mean()
-    )
+    total, mean = (volume(given, opacities, reduction=kind, backend=BACKEND).item() for kind in ("sum", "mean"))
+    assert total == pytest.approx(scales.prod(1).sum())
+    assert mean == pytest.approx(scales.prod(1).mean())
 
 
 def test_what_is_not_drawn_does_not_count() -> None:
     scales, opacities = torch.full((4, 3), 2.0), torch.tensor([0.5, 0.0, 0.2, 0.0])
     scales[1] = scales[3] = 0.0
-    assert volume(scales, opacities, reduction="mean", backend=reference_backend()).item() == 8.0
-    assert volume(0.0 * scales, 0.0 * opacities, reduction="mean", backend=reference_backend()).item() == 0.0
+    assert volume(scales, opacities, reduction="mean", backend=BACKEND).item() == 8.0
+    assert volume(0.0 * scales, 0.0 * opacities, reduction="mean", backend=BACKEND).item() == 0.0
 
 
 def test_volume_of_nothing_is_zero_and_differentiable() -> None:
     scales = torch.zeros(0, 3, requires_grad=True)
-    volume(scales, torch.ones(len(scales)), reduction="mean", backend=reference_backend()).backward()
+    volume(scales, torch.ones(len(scales)), reduction="mean", backend=BACKEND).backward()
     assert scales.grad is not None
 
 
@@ -38,16 +37,14 @@ def test_offset_distance_counts_what_is_beyond_two_voxels() -> None:
     anchors = random_scene().anchors
     offsets = anchors.offsets.double().numpy()
     scaled = offsets * np.exp(anchors.log_offset_scales.double().numpy())[:, None]
-    length = np.abs(scaled)
-    eps = 0.03
+    length, eps = np.abs(scaled), 0.03
     expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
     weights = InitialLossWeights(offset_distance=1.0, offset_distance_reduction="sum")
-    assert offset_distance(
-        anchors, voxel_size=eps, weights=weights, backend=reference_backend()
-    ).item() == pytest.approx(expected, rel=1e-5)
+    found = offset_distance(anchors, voxel_size=eps, weights=weights, backend=BACKEND)
+    assert found.item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_offsets_within_two_voxels_cost_nothing() -> None:
     anchors = random_scene().anchors
     weights = InitialLossWeights(offset_distance=1.0)
-    assert offset_distance(anchors, voxel_size=10.0, weights=weights, backend=reference_backend()).item() == 0.0
+    assert offset_distance(anchors, voxel_size=10.0, weights=weights, backend=BACKEND).item() == 0.0

@@ -8,13 +8,7 @@ import torch
 
 from structgstream.frames import MultiViewFrame
 from structgstream.training.online.config import MotionConfig
-from structgstream.training.online.measure import (
-    flow_evidence,
-    measure,
-    primitive_centers,
-    primitive_sums,
-    slot_count,
-)
+from structgstream.training.online.measure import flow_evidence, measure, primitive_centers, primitive_sums, slot_count
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend

@@ -13,12 +13,12 @@ from structgstream.scene.scene import Scene
 from structgstream.training.losses import GradientStatistics, SceneLoss
 from structgstream.training.online.config import OnlineConfig, PatchingConfig
 from structgstream.training.online.iterations import OnlineHooks, StartingPoint
+from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.optim import Adam, LastPass
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
-from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import random_scene
 from tests.support.worlds import moving_world
@@ -26,20 +26,20 @@ from tests.support.worlds import moving_world
 CPU = torch.device("cpu")
 BACKEND = quickest_backend()
 WORLD = moving_world(1)
-VIEWS = training_views(WORLD.frames[0], WORLD.rig, CPU)
+VIEWS = WORLD.views()
 CAMERA = VIEWS[0].camera
+WITH_FREE = random_scene(60, free=5, cameras=4, seed=4)
 
 
 def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, rest_every: int = 1) -> OnlineHooks:
     scene = start.scene
     parameters = Parameters.of(scene, trained=parameters_of_fields({"anchor_positions", "free"}))
-    gaussians = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
     free_set = FreeSet(
         config=PatchingConfig(),
         template=scene,
         parameters=parameters,
         adam=Adam(BACKEND, parameters.values),
-        statistics=GradientStatistics(gaussians, CPU),
+        statistics=GradientStatistics(slot_count(scene), CPU),
         views=start.views,
         frame_index=1,
         room=100,
@@ -113,7 +113,7 @@ def tensors(value: Any) -> list[torch.Tensor]:
 
 def test_nothing_of_a_loss_keeps_its_graph_once_the_step_is_taken() -> None:
     """What would be kept alive binds the next recording to another stream of the GPU."""
-    loss = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4))).loss(1, VIEWS[0])
+    loss = hooks_of(started(WITH_FREE)).loss(1, VIEWS[0])
     assert sum(tensor.requires_grad for tensor in tensors(loss)) > 9
     assert not any(tensor.requires_grad for tensor in tensors(loss.detached()))
     assert len(tensors(loss.detached())) > 15
@@ -135,16 +135,15 @@ def test_all_tiles_are_drawn_where_all_changed_or_no_visit_rests() -> None:
 
 
 def test_a_frame_is_patched_once_at_its_iteration() -> None:
-    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3)
-    faint = hooks.parameters.values["free_logit_opacities"]
-    faint.data[2] = -9.0
+    hooks = hooks_of(started(WITH_FREE), patch_at=3)
+    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
     for iteration in (1, 2, 3, 4):
         iterate(hooks, iteration)
         assert hooks.free_set.pruned == (iteration >= 3)
 
 
 def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
-    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=1, patches=False)
+    hooks = hooks_of(started(WITH_FREE), patch_at=1, patches=False)
     hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
     iterate(hooks, 1)
     assert hooks.free_set.pruned == 0
@@ -152,11 +151,9 @@ def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
 
 
 def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> None:
-    scene = random_scene(60, free=5, cameras=4, seed=4)
-    assert hooks_of(started(scene)).counts() == (60, 5)
-    anchors = torch.arange(60) < 20
-    parted = SimpleNamespace(anchors=anchors, free=torch.arange(5) < 2)
-    split = DynamicSplit.of(scene, cast(Any, parted))
+    assert hooks_of(started(WITH_FREE)).counts() == (60, 5)
+    parted = SimpleNamespace(anchors=torch.arange(60) < 20, free=torch.arange(5) < 2)
+    split = DynamicSplit.of(WITH_FREE, cast(Any, parted))
     start = StartingPoint(split.dynamic, VIEWS, torch.zeros(22, 3), split)
     assert hooks_of(start).counts() == (20, 5)
 

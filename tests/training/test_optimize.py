@@ -9,27 +9,13 @@ import torch
 from torch import Tensor
 
 from structgstream.scene.state import PAPER_DYNAMIC
-from structgstream.training.losses import Loss, LossWeights, view_loss
+from structgstream.training.losses import Loss
 from structgstream.training.optim import Adam, Hooks, Schedule, gradients_of, leaves, minimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.result import Step, Stopwatch
-from structgstream.training.views import View
 from tests.support.backends import quickest_backend
-from tests.support.rigs import arc_rig, random_scene
-
-CPU = torch.device("cpu")
-
-
-def loss_of(parameters, scene, **weights):
-    view = View(0, arc_rig()["cam01"], torch.full((32, 48, 3), 90, dtype=torch.uint8))
-    return view_loss(
-        parameters.scene(scene),
-        view,
-        backend=quickest_backend(),
-        weights=LossWeights(**weights),
-        track_screen=True,
-        watch=Stopwatch(),
-    )
+from tests.support.rigs import random_scene
+from tests.training.test_step import loss_of
 
 
 @dataclass
@@ -85,13 +71,13 @@ def test_empty_and_fixed_leaves_have_no_gradient() -> None:
     assert gradients_of(Loss(values["fixed"].sum(), {}), values, Stopwatch()) == ({}, None)
     scene = random_scene()
     parameters = Parameters.of(scene, trained=frozenset(FREE_ROWS))
-    assert gradients_of(loss_of(parameters, scene), parameters.values, Stopwatch())[0] == {}
+    assert gradients_of(loss_of(parameters, scene)[0], parameters.values, Stopwatch())[0] == {}
 
 
 def test_gradients_reach_exactly_the_trained_parameters() -> None:
     scene = random_scene(free=3)
     parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
-    loss = loss_of(parameters, scene)
+    loss, _ = loss_of(parameters, scene)
     gradients, screen = gradients_of(loss, parameters.values, Stopwatch())
     assert set(gradients) == parameters_of_fields(PAPER_DYNAMIC)
     assert screen is not None
@@ -105,7 +91,7 @@ def test_a_view_that_shows_nothing_has_no_gradients() -> None:
     hidden = opaque._replace(w2=torch.zeros_like(opaque.w2), b2=torch.full_like(opaque.b2, -1.0))
     scene = replace(scene, mlps=scene.mlps._replace(opacity=hidden))
     parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
-    loss = loss_of(parameters, scene, volume=0.0)
+    loss, _ = loss_of(parameters, scene, volume=0.0)
     assert len(loss.rendering.gaussians) == 0
     gradients, screen = gradients_of(loss, parameters.values, Stopwatch())
     assert all(not gradient.any() for gradient in gradients.values())

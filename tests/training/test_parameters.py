@@ -17,12 +17,8 @@ def test_taking_apart_and_putting_together_changes_no_bit() -> None:
 
 
 def test_the_dynamic_fields_name_what_is_trained() -> None:
-    assert parameters_of_fields(PAPER_DYNAMIC) == {
-        "anchor_positions",
-        "offset_scales",
-        "covariance_mlp",
-        *FREE_ROWS,
-    }
+    names = {"anchor_positions", "offset_scales", "covariance_mlp", *FREE_ROWS}
+    assert parameters_of_fields(PAPER_DYNAMIC) == names
 
 
 def test_parameters_are_copies() -> None:
@@ -43,7 +39,5 @@ def test_the_gauge_holds_while_colour_is_trained() -> None:
 
 def test_detached_scenes_carry_no_graph() -> None:
     scene = random_scene(free=2)
-    trained = parameters_of_fields(PAPER_DYNAMIC)
-    assert not any(
-        v.requires_grad for v in state_of(detached(Parameters.of(scene, trained=trained).scene(scene))).values()
-    )
+    parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
+    assert not any(value.requires_grad for value in state_of(detached(parameters.scene(scene))).values())

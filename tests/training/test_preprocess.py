@@ -6,7 +6,6 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import FramePictures, PictureChange, preprocess
-from structgstream.training.views import training_views
 from tests.support.worlds import moving_world
 
 WORLD = moving_world(2, cameras=6, movers=60, speed=0.08, width=128, height=96)
@@ -16,7 +15,7 @@ START = SceneFlowConfig(enabled=True, views=3)
 
 def pictures(*, motion: MotionConfig = MOTION, start: SceneFlowConfig = START, first: bool = False) -> FramePictures:
     backend = reference_backend()
-    before = None if first else training_views(WORLD.frames[0], WORLD.rig, backend.device)
+    before = None if first else WORLD.views()
     return preprocess(WORLD.frames[1], WORLD.rig, before=before, motion=motion, scene_flow=start, backend=backend)
 
 

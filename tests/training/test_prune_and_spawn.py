@@ -1,31 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Before the first iteration: Gaussians are spawned where something emerged, and those with the error are pruned."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
-from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.kernels.native import native_reason
+from structgstream.kernels.backend import Backend
+from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnConfig, SpawnRules, ThinSpawnConfig
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.spawn import SpawnResult, Sweep, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
-from structgstream.training.views import training_views
-from tests.support.backends import quickest_backend
+from tests.support.backends import on_each_backend, quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import emerging_ball, moved_since, moving_world
 
-CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
 CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2, planes=96))  # so small a ball needs more depths
-BACKENDS = [
-    pytest.param(reference_backend, id="reference"),
-    pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
-]
 
 
 def renewed(
@@ -35,25 +30,27 @@ def renewed(
     config: SpawnConfig = CONFIG,
     room: int = 1000,
     floor: ResidualFloor | None = None,
+    residual_threshold: float = 0.0,
 ) -> SpawnResult:
-    motion = MotionConfig(enabled=True, picture_scale=1.0)
-    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
-    split = DynamicSplit.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
+    motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=residual_threshold)
+    first, views = (WORLD.views(t) for t in (0, 1))
+    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor
+    split = DynamicSplit.of(scene, moved_since(scene, views, first, config=motion, backend=backend, floor=floor))
     return prune_and_spawn(
         split,
         views,
         find_active_tiles(split, views, config=motion, backend=backend),
         first_identity=1 << 32,
-        floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
+        floor=floor,
         room=room,
         config=config,
         backend=backend,
     )
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_an_emerging_ball_is_spawned_where_it_is(backend) -> None:
-    found, ball = renewed(backend()), emerging_ball(0.95)
+@on_each_backend
+def test_an_emerging_ball_is_spawned_where_it_is(build: Callable[[], Backend]) -> None:
+    found, ball = renewed(build()), emerging_ball(0.95)
     spawned = found.new_free
     assert len(spawned) >= 3
     assert not found.refused
@@ -66,8 +63,7 @@ def test_an_emerging_ball_is_spawned_where_it_is(backend) -> None:
 
 def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_floor_is_eased() -> None:
     scene, backend = WORLD.scene, quickest_backend()
-    first = training_views(WORLD.frames[0], WORLD.rig, CPU)
-    floor = residual_floor(scene, first, scale=1.0, backend=backend)
+    floor = residual_floor(scene, WORLD.views(), scale=1.0, backend=backend)
     bad = replace(floor, maps={i: torch.full_like(of_view, 0.02) for i, of_view in floor.maps.items()})
     for of_view in bad.maps.values():
         of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
@@ -119,34 +115,11 @@ def test_when_everything_is_missing_nothing_is_spawned_and_that_is_reported() ->
 def test_a_ghost_dies() -> None:
     """The ball was there in a wrong place before: nobody sees it there now."""
     ghost = emerging_ball(0.95)
-    free = replace(
-        WORLD.scene.free,
-        means=ghost.means + torch.tensor([[0.5, 0.0, 0.0]]),
-        log_scales=ghost.scales.log(),
-        quats=ghost.quats,
-        logit_opacities=torch.logit(ghost.opacities),
-        colors=ghost.colors,
-        births=torch.tensor([3]),
-    )
-    backend = quickest_backend()
-    scene = replace(WORLD.scene, free=free)
-    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
-    motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
-    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    selection = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
-    assert selection.free.all(), "what is wrong passes the gate"
-    split = DynamicSplit.of(scene, selection)
-    found = prune_and_spawn(
-        split,
-        views,
-        find_active_tiles(split, views, config=motion, backend=backend),
-        first_identity=1 << 32,
-        floor=floor,
-        room=1000,
-        config=CONFIG,
-        backend=backend,
-    )
-    assert found.kept.tolist() == [False]
+    look = ghost.scales.log(), ghost.colors
+    places = ghost.means + torch.tensor([[0.5, 0.0, 0.0]])
+    free = FreeGaussians.spawned(places, *look, opacity=0.95, first_identity=3)
+    found = renewed(quickest_backend(), scene=replace(WORLD.scene, free=free), residual_threshold=0.05)
+    assert found.kept.tolist() == [False], "what is wrong is dynamic"
 
 
 BLIND = replace(CONFIG, missing_threshold=0.9)

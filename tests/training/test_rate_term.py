@@ -24,10 +24,9 @@ def test_leaving_a_bin_has_a_price() -> None:
     values["offset_scales"] = values["offset_scales"].detach().clone()
     values["offset_scales"][7, 0] += 0.75
     assert rate_term.value(values, BACKEND).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
-    price = rate_term.value(
-        {**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1}, BACKEND
-    )
-    (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
+    positions = parameters.values["anchor_positions"]
+    price = rate_term.value({**parameters.values, "anchor_positions": positions + 0.1}, BACKEND)
+    (gradient,) = torch.autograd.grad(price, [positions])
     assert (gradient > 0).all(), "it pulls back"
 
 

@@ -16,18 +16,13 @@ from structgstream.training.residuals import (
     residual_floor,
     residuals,
 )
-from structgstream.training.views import blackened, training_views
+from structgstream.training.views import blackened
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import moved_since, moving_world
 
-CPU = torch.device("cpu")
 WORLD = moving_world(3, speed=0.06, movers=20)
-BACKEND = quickest_backend()
-
-
-def views(t: int):
-    return training_views(WORLD.frames[t], WORLD.rig, CPU)
+BACKEND, views = quickest_backend(), WORLD.views
 
 
 @pytest.mark.parametrize(("size", "pixels"), [((9, 14), 3), ((9, 14), 5), ((2, 14), 7), ((1, 1), 5)])
@@ -59,7 +54,7 @@ def test_gradients_of_a_recorded_rendering_are_those_of_its_formula() -> None:
 
 
 def test_the_floor_is_what_frame_0_missed_nearby() -> None:
-    spoiled = views(0)
+    spoiled = views()
     image = spoiled[1].image.clone()
     image[10, 20] = 255 - image[10, 20]
     spoiled[1] = replace(spoiled[1], image=image)
@@ -100,7 +95,7 @@ def test_slow_change_is_seen_by_the_residual_alone() -> None:
 def test_what_frame_0_already_missed_does_not_count() -> None:
     other = moving_world(1, movers=0)
     wrong = replace(WORLD.scene, anchors=replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions + 0.05))
-    seen = training_views(other.frames[0], other.rig, CPU)
+    seen = other.views()
     floor = residual_floor(wrong, seen, scale=1.0, backend=BACKEND)
     config = varied(MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05), REACH_PIXELS=1)
     assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()

@@ -13,10 +13,10 @@ from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.scene.render import Rendering
 from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.frame0.roving import RovingViews, alternating
-from structgstream.training.views import View, training_views
+from structgstream.training.views import View
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
-from tests.support.worlds import World, moving_world, psnr, rendered
+from tests.support.worlds import World, moving_world
 from tests.training.test_initial import QUICK
 
 CPU = torch.device("cpu")
@@ -49,7 +49,7 @@ def test_views_between_the_cameras_help_a_held_out_one() -> None:
     for pictures in ((), roving):
         fit = fit_first_frame(frame, rig, points, config=config, backend=backend, seed=0, roving=pictures)
         assert fit.scene.camera_color.gains.shape == (2, 3)  # of the training cameras alone
-        scores.append(psnr(rendered(fit.scene, world, "cam00"), frame.images["cam00"]))
+        scores.append(world.psnr(fit.scene))
     assert scores[1] > scores[0] + 1.0
 
 
@@ -62,14 +62,14 @@ def test_the_exposure_of_the_roving_camera_is_not_the_scene_s() -> None:
     for colors in (True, False):
         config = replace(QUICK, camera_color=colors)
         fit = fit_first_frame(frame, rig, points, config=config, backend=backend, seed=0, roving=dark)
-        scores[colors] = psnr(rendered(fit.scene, world, "cam00"), frame.images["cam00"])
+        scores[colors] = world.psnr(fit.scene)
     assert scores[True] > scores[False] + 1.0
 
 
 def test_views_come_by_turns() -> None:
-    frame, rig = moving_world(1).frames[0], moving_world(1).rig
-    still = training_views(frame, rig, CPU)
-    roving = RovingViews.of(walked(moving_world(1), names=("cam00",)), first=len(still), fits_gains=True, device=CPU)
+    world = moving_world(1)
+    still = world.views()
+    roving = RovingViews.of(walked(world, names=("cam00",)), first=len(still), fits_gains=True, device=CPU)
     generator = torch.Generator().manual_seed(0)
     taken = [*islice(alternating(still, roving.views, [(6, 0.5)], generator=generator), 12)]
     assert [roving.has(view) for view in taken] == [False, True] * 6

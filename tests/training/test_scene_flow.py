@@ -7,26 +7,22 @@ from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import flow_views
 from structgstream.training.online.scene_flow import apply_scene_flow
 from structgstream.training.online.split import DynamicSplit, with_displacements
-from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moved_since, moving_world
 
-CPU = torch.device("cpu")
 BACKEND = quickest_backend()
 MOTION = MotionConfig(enabled=True, picture_scale=0.5)
 SPEED = 0.08  # 2.1 pixels of the pictures below
 
 
-def world() -> World:
-    return moving_world(2, cameras=6, movers=60, speed=SPEED, width=128, height=96)
+def world(*, speed: float = SPEED) -> World:
+    return moving_world(2, cameras=6, movers=60, speed=speed, width=128, height=96)
 
 
 def begun(scenery: World, *, rounds: int = 2, enabled: bool = True):
     config = SceneFlowConfig(enabled=enabled, rounds=rounds)
-    views, before = (training_views(scenery.frames[t], scenery.rig, CPU) for t in (1, 0))
-    selection = moved_since(
-        scenery.scene, views, before, config=MOTION, backend=BACKEND, flow_from=flow_views(views, 1, config)
-    )
+    views, before = (scenery.views(t) for t in (1, 0))
+    selection = moved_since(scenery.scene, views, before, config=MOTION, flow_from=flow_views(views, 1, config))
     split = DynamicSplit.of(scenery.scene, selection)
     priors = torch.zeros(len(selection.primitives), 3)
     return split, apply_scene_flow(split, views, priors, config=config, motion=MOTION, backend=BACKEND)
@@ -44,17 +40,16 @@ def test_anchors_begin_near_where_they_have_gone() -> None:
 
 def test_fast_movers_are_counted_and_how_many_of_them_flow_displaces() -> None:
     """Fast is more than an eightieth of the width: here 1.6 pixels."""
-    _, found = begun(moving_world(2, cameras=6, movers=60, speed=2 * SPEED, width=128, height=96))
+    _, found = begun(world(speed=2 * SPEED))
     displaced, _, fast, fast_displaced = found.counts.values()
     assert 0.5 * len(found.displacements) < fast <= len(found.displacements)
     assert 0.8 * fast < fast_displaced <= min(fast, displaced)
-    _, slow = begun(moving_world(2, cameras=6, movers=60, speed=0.5 * SPEED, width=128, height=96))
+    _, slow = begun(world(speed=0.5 * SPEED))
     assert slow.counts["fast"] == slow.counts["fast displaced"] == 0
 
 
 def test_the_second_round_acts_where_much_moves_fast() -> None:
-    scenery = moving_world(2, cameras=6, movers=60, speed=2 * SPEED, width=128, height=96)
-    once, twice = (begun(scenery, rounds=rounds)[1] for rounds in (1, 2))
+    once, twice = (begun(world(speed=2 * SPEED), rounds=rounds)[1] for rounds in (1, 2))
     assert once.counts["corrected"] == 0
     assert twice.counts["corrected"] > 0
     assert not torch.equal(once.displacements, twice.displacements)
@@ -75,7 +70,7 @@ def test_displaced_moves_anchors_and_free_gaussians() -> None:
 
 
 def test_flow_is_looked_for_in_turns_where_there_are_many_views() -> None:
-    views = training_views(world().frames[0], world().rig, CPU)  # five
+    views = world().views()  # five
     config = SceneFlowConfig(enabled=True, views=3)
     turns = [flow_views(views, frame, config) for frame in (1, 2)]
     assert [len(turn) for turn in turns] == [2, 3]

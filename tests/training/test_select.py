@@ -26,8 +26,8 @@ WORLD = moving_world(2, speed=0.06, movers=20)
 
 
 def moving(before: int = 0, now: int = 1, *, config: MotionConfig = CONFIG):
-    views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (now, before))
-    return moved_since(WORLD.scene, views, earlier, config=config, backend=quickest_backend())
+    views, earlier = (WORLD.views(t) for t in (now, before))
+    return moved_since(WORLD.scene, views, earlier, config=config)
 
 
 def test_the_anchors_that_moved_are_found_and_few_others() -> None:
@@ -64,7 +64,7 @@ def test_one_view_is_not_enough() -> None:
 
 def test_each_view_tells_which_gaussians_it_shows() -> None:
     backend, found = quickest_backend(), moving()
-    views = training_views(WORLD.frames[1], WORLD.rig, CPU)
+    views = WORLD.views(1)
     assert found.visible.keys() == {view.index for view in views}
     for view in views:
         drawn = torch.zeros(60 * 5, dtype=torch.bool)
@@ -76,10 +76,10 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
 
 def test_what_moved_before_moves_more_easily() -> None:
     strict = varied(replace(CONFIG, hysteresis=0.2), MIN_CHANGED_SHARE=0.9)
-    views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
+    views, earlier = (WORLD.views(t) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:
-        return moved_since(WORLD.scene, views, earlier, config=strict, backend=quickest_backend(), older=older).anchors
+        return moved_since(WORLD.scene, views, earlier, config=strict, older=older).anchors
 
     shift = torch.zeros_like(WORLD.scene.anchors.positions)
     shift[:20] = 0.01
@@ -109,29 +109,23 @@ def test_what_changed_is_reported_by_row_and_by_birth() -> None:
 def test_free_gaussians_that_no_view_shows_stay() -> None:
     """A camera that is absent now may be the only one that sees them."""
     places = torch.tensor([[0.0, 0.0, -0.8], [0.0, 0.0, -50.0]])  # The second is behind all cameras.
-    free = FreeGaussians(
-        means=places,
-        log_scales=torch.full((2, 3), 0.1).log(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4),
-        logit_opacities=torch.tensor([2.0, 2.0]),
-        colors=torch.full((2, 3), 0.5),
-        births=torch.tensor([1, 2]),
-    )
+    look = torch.full((2, 3), 0.1).log(), torch.full((2, 3), 0.5)
+    free = FreeGaussians.spawned(places, *look, opacity=0.9, first_identity=1)
     scene = replace(WORLD.scene, free=free)
-    views = training_views(WORLD.frames[0], WORLD.rig, CPU)
-    part = DynamicSplit.of(scene, moved_since(scene, views, views, config=CONFIG, backend=quickest_backend()))
+    views = WORLD.views()
+    part = DynamicSplit.of(scene, moved_since(scene, views, views, config=CONFIG))
     assert part.merge(part.dynamic).free.births.tolist() == [1, 2]
 
 
 def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
     """The result is that of the others; but what it shows counts as visible, so that it is trained on."""
-    views, before = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
-    back, others = views[1], [view for n, view in enumerate(views) if n != 1]
+    views, before = (WORLD.views(t) for t in (1, 0))
+    back = views[1]
+    others, known = ([view for view in of if view.index != back.index] for of in (views, before))
     floor = ResidualFloor(1.0, {view.index: torch.zeros(32, 48) for view in views})
+    config = replace(CONFIG, residual_threshold=0.1)
     for given in (None, floor):
-        options = {"config": replace(CONFIG, residual_threshold=0.1), "backend": quickest_backend(), "floor": given}
-        found = moved_since(WORLD.scene, views, [view for view in before if view.index != back.index], **options)
-        alone = moved_since(WORLD.scene, others, [view for view in before if view.index != back.index], **options)
+        found, alone = (moved_since(WORLD.scene, of, known, config=config, floor=given) for of in (views, others))
         assert torch.equal(found.anchors, alone.anchors)
         assert found.anchors.any()
         assert found.inliers == (0, 1, 2, 3)
@@ -140,26 +134,23 @@ def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
 
 def test_a_camera_without_a_floor_votes_by_its_pictures_alone() -> None:
     """It was absent from frame 0, and its residuals, being of unknown origin, would make everything move."""
-    views, before = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
-    dark = [replace(view, image=view.image // 2) if view.index == 2 else view for view in views]
-    dark_before = [replace(view, image=view.image // 2) if view.index == 2 else view for view in before]
+    views, before = (WORLD.views(t) for t in (1, 0))
+    dark = [
+        [replace(view, image=view.image // 2) if view.index == 2 else view for view in of] for of in (views, before)
+    ]
     known = {view.index: torch.ones(32, 48) for view in views if view.index != 2}
     config = replace(CONFIG, residual_threshold=0.05)
-    floor, backend = ResidualFloor(1.0, known), quickest_backend()
-    found = moved_since(WORLD.scene, dark, dark_before, config=config, backend=backend, floor=floor)
-    plain = moved_since(WORLD.scene, dark, dark_before, config=CONFIG, backend=backend)
+    found = moved_since(WORLD.scene, *dark, config=config, floor=ResidualFloor(1.0, known))
+    plain = moved_since(WORLD.scene, *dark, config=CONFIG)
     assert torch.equal(found.anchors, plain.anchors)
 
 
 def test_what_a_mask_hides_gets_no_vote_from_its_view() -> None:
-    frames = [replace(WORLD.frames[t], masks={}) for t in (0, 1)]
     hidden = {name: np.zeros((32, 48), bool) for name in WORLD.rig.training}
     for mask in hidden.values():
         mask[:, :3] = True  # a camera that shows something still is present
     for count, expected in ((2, True), (3, False)):
         masks = {name: hidden[name] for name in WORLD.rig.training[:count]}
-        views, before = (
-            training_views(replace(frame, masks=masks), WORLD.rig, CPU) for frame in (frames[1], frames[0])
-        )
-        found = moved_since(WORLD.scene, views, before, config=CONFIG, backend=quickest_backend())
+        views, before = (training_views(replace(WORLD.frames[t], masks=masks), WORLD.rig, CPU) for t in (1, 0))
+        found = moved_since(WORLD.scene, views, before, config=CONFIG)
         assert bool(found.anchors[:20].any()) == expected  # two of the four see it, then one

@@ -11,19 +11,15 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.training.online.config import SpawnRules
-from structgstream.training.online.spawn import (
-    _merge_points,
-    outlier_mask,
-    spawn_by_sweep,
-)
+from structgstream.training.online.spawn import Spawned, _merge_points, outlier_mask, spawn_by_sweep
 from structgstream.training.online.view_residuals import ViewResidual, view_residuals
 from structgstream.training.residuals import ResidualFloor
-from structgstream.training.views import View, training_views
+from structgstream.training.views import View
 from tests.support.worlds import moving_world
 
 RULES = SpawnRules()
 WORLD = moving_world(1, width=96, height=64)
-VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
+VIEWS = WORLD.views()
 
 
 def test_an_outlier_takes_two_views_and_half_of_those_that_see() -> None:
@@ -46,6 +42,10 @@ def compared(picture: torch.Tensor, view: View, *, rules: SpawnRules, floor: Res
     color = CameraColor.identity(view.index + 1)
     (found,) = view_residuals([picture], [view], color, floor=floor, rules=rules, backend=reference_backend())
     return found
+
+
+def nothing_missing(view: View) -> ViewResidual:
+    return ViewResidual(view, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
 
 
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
@@ -75,7 +75,7 @@ def test_a_nearer_near_plane_has_as_many_depths_for_a_pixel_of_disparity() -> No
 
 
 def test_without_anything_missing_nothing_is_spawned() -> None:
-    views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
+    views = [nothing_missing(view) for view in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
     found = spawn_by_sweep(views, depths, color, first_identity=7, rules=RULES, backend=reference_backend())
@@ -86,7 +86,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     """Four views miss a ball that frame 0 lacked; a fifth that is masked, or was absent from frame 0, misses nothing,
     and as an equal voice would prevent spawning."""
     world = moving_world(1, width=96, height=64, cameras=6, emerges_at=0)
-    views = training_views(world.frames[0], world.rig, torch.device("cpu"))
+    views = world.views()
     backend, color = reference_backend(), CameraColor.identity(len(views))
     without = {v.index: draw(world.scene.gaussians(v.camera, backend), v.camera, backend).image for v in views}
     depths = {v.index: torch.full((64, 96), torch.inf) for v in views}
@@ -98,7 +98,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
         return len(spawn_by_sweep([*found, last], depths, color, first_identity=0, rules=rules, backend=backend).free)
 
     last = views[-1]
-    silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
+    silent = nothing_missing(last)
     masked = replace(last, mask=torch.zeros(64, 96, dtype=torch.bool), image=torch.zeros_like(last.image))
     unknown = replace(floor, maps={index: m for index, m in floor.maps.items() if index != last.index})
     absent = compared(without[last.index].clamp(0, 1), last, floor=unknown, rules=rules)
@@ -108,9 +108,10 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     assert spawned(absent) == spawned(seen) > spawned(silent)
 
 
-def lines(*lengths: int) -> torch.Tensor:
-    """Points ``[P, 3]`` in straight lines of these lengths, a voxel apart in a line, lines far from each other."""
-    return torch.cat([torch.tensor([[float(x), 50.0 * row, 0.0] for x in range(n)]) for row, n in enumerate(lengths)])
+def merged(rules: SpawnRules) -> Spawned:
+    """Of points in straight lines of 4, 8 and 3, a voxel apart in a line, lines far from each other."""
+    points = torch.tensor([[float(x), 50.0 * row, 0.0] for row, n in enumerate((4, 8, 3)) for x in range(n)])
+    return _merge_points(points, torch.rand(15, 3), torch.ones(15), first_identity=7, rules=rules)
 
 
 @pytest.mark.parametrize(
@@ -127,9 +128,7 @@ def lines(*lengths: int) -> torch.Tensor:
 def test_where_there_are_too_many_whole_clusters_are_spawned_or_none(
     overflow: str, most: int, rows: list[int], refused: int
 ) -> None:
-    points = lines(4, 8, 3)
-    rules = replace(RULES, overflow=overflow, most=most, min_hits=1)
-    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_identity=7, rules=rules)
+    found = merged(replace(RULES, overflow=overflow, most=most, min_hits=1))
     assert found.refused_count == refused
     assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
     assert len(found.free) == sum((4, 8, 3)[row] for row in rows)
@@ -138,12 +137,9 @@ def test_where_there_are_too_many_whole_clusters_are_spawned_or_none(
 
 def test_where_there_are_too_many_spawned_gaussians_are_coarser() -> None:
     rules = replace(RULES, overflow="coarser", most=9, min_hits=1)
-    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_identity=0, rules=rules)
+    found = merged(rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
     assert found.merged_count == 15 - len(found.free), "a cap that binds is reported"
     assert float(found.free.log_scales.mean()) > float(torch.tensor(RULES.size).log())
     unbound = replace(rules, most=15)
-    assert (
-        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_identity=0, rules=unbound).merged_count
-        == 0
-    )
+    assert merged(unbound).merged_count == 0

@@ -13,11 +13,9 @@ from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
-from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.worlds import emerging_ball, moved_since, moving_world
 
-CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
 RULES = SpawnRules(min_hits=2)
 
@@ -25,7 +23,7 @@ RULES = SpawnRules(min_hits=2)
 def sweep(rules: SpawnRules = RULES) -> Sweep:
     """Over the frame in which a ball emerges."""
     backend, motion = quickest_backend(), MotionConfig(enabled=True, picture_scale=1.0)
-    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
+    first, views = (WORLD.views(t) for t in (0, 1))
     split = DynamicSplit.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
     active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)

@@ -4,11 +4,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import pytest
 import torch
 
-from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.kernels.native import native_reason
+from structgstream.kernels.backend import Backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -20,14 +18,13 @@ from structgstream.training.online.split import DynamicSplit, changed_tiles, fin
 from structgstream.training.optim import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
-from structgstream.training.views import training_views
+from tests.support.backends import on_each_backend
 from tests.support.rigs import random_scene
 from tests.support.varied import varied
 from tests.support.worlds import moving_world
 
-CPU = torch.device("cpu")
 WORLD = moving_world(2, width=96, height=64)
-VIEWS = training_views(WORLD.frames[1], WORLD.rig, CPU)
+VIEWS = WORLD.views(1)
 SCENE = random_scene(60, free=8, cameras=4, seed=4)
 
 
@@ -65,10 +62,7 @@ def test_what_moved_moves_and_births_stay_in_order() -> None:
     assert torch.equal(whole.free.means[8], moving.free.means[0])
 
 
-@pytest.mark.parametrize(
-    "build",
-    [reference_backend, pytest.param(cpu_backend, marks=pytest.mark.skipif(bool(native_reason()), reason="not built"))],
-)
+@on_each_backend
 def test_active_tiles_draw_and_learn_what_the_whole_picture_would(build: Callable[[], Backend]) -> None:
     """The gradient of a step with them is that of the same step over the whole picture: to float32 rounding."""
     backend = build()

@@ -7,15 +7,8 @@ from structgstream.training.losses import GradientStatistics
 
 
 def rendering(ids: list[int], radii: list[float], *, width: int = 20, height: int = 10) -> Rendering:
-    n = len(ids)
-    gaussians = Gaussians(
-        torch.zeros(n, 3),
-        torch.zeros(n, 4),
-        torch.zeros(n, 3),
-        torch.zeros(n),
-        torch.zeros(n, 3),
-        torch.tensor(ids),
-    )
+    none = torch.zeros(len(ids), 3)
+    gaussians = Gaussians(none, torch.zeros(len(ids), 4), none, none[:, 0], none, torch.tensor(ids))
     return Rendering(torch.zeros(height, width, 3), torch.zeros(height, width), torch.tensor(radii), gaussians, None)
 
 

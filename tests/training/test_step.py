@@ -17,8 +17,6 @@ from structgstream.training.views import View, blackened
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
-CPU = torch.device("cpu")
-
 
 def loss_of(parameters, scene, **weights):
     view = View(0, arc_rig()["cam01"], torch.full((32, 48, 3), 90, dtype=torch.uint8))

@@ -35,9 +35,8 @@ def test_new_anchors_are_as_large_as_their_gaussians_and_look_like_their_neighbo
     started = warm_start(replace(scene, free=free), cell=CELL)
     nearest = int((scene.anchors.positions - 9.0).norm(dim=1).argmin())
     assert torch.allclose(started.anchors.positions[-1], torch.full((3,), 9.0))
-    assert torch.allclose(
-        started.anchors.log_base_scales[-1].exp(), torch.full((3,), 2.0 * float(torch.tensor(-2.0).exp()))
-    )
+    size = torch.full((3,), 2.0 * float(torch.tensor(-2.0).exp()))
+    assert torch.allclose(started.anchors.log_base_scales[-1].exp(), size)
     assert torch.equal(started.anchors.features[-1], scene.anchors.features[nearest])
     assert not started.anchors.offsets[-1].any()
 

@@ -27,14 +27,28 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _View:
-    """The arguments of a rendering except Gaussians."""
+class Scenery:
+    """The arguments of ``rasterize`` that have no gradient, for CPU and CUDA: contiguous, numbers float32."""
 
     viewport: Viewport
     background: Tensor | None
     tiles: Tensor | None
     trained: int
     intervals: Tensor | None
+
+    @classmethod
+    def of(
+        cls,
+        gaussians: Gaussians,
+        viewport: Viewport,
+        background: Tensor | None,
+        tiles: TileSelection | None,
+        trained: int | None,
+    ) -> "Scenery":
+        """Of the arguments of ``rasterize``."""
+        mask = None if tiles is None else tiles.mask.contiguous()
+        count = len(gaussians) if trained is None else min(trained, len(gaussians))
+        return cls(viewport, constant(background), mask, count, constant(gaussians.sampling_intervals))
 
 
 def shape_arguments(gaussians: Gaussians) -> list[Tensor]:
@@ -50,7 +64,7 @@ def camera_arguments(viewport: Viewport) -> list[Tensor | int | float]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, view: _View, onto: Tensor | None, screen_offsets: Tensor | None, *gaussians: Tensor
+        ctx: Any, view: Scenery, onto: Tensor | None, screen_offsets: Tensor | None, *gaussians: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``gaussians``: means, quaternions, scales, opacities and colours."""
         means, count = gaussians[0], gaussians[0].shape[0]
@@ -129,13 +143,7 @@ def rasterize(
         assert onto.is_contiguous()
         assert not onto.requires_grad
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
-    view = _View(
-        viewport,
-        constant(background),
-        None if tiles is None else tiles.mask.contiguous(),
-        n if trained is None else trained,
-        constant(gaussians.sampling_intervals),
-    )
+    view = Scenery.of(gaussians, viewport, background, tiles, trained)
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
     image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
         view, onto, offsets, *(tensor.contiguous() for tensor in tensors)

@@ -113,10 +113,8 @@ def cuda_stream(device: torch.device) -> int:
 
 def source_folder() -> Path:
     """The folder of the installed sources; that of the clone for a package that runs from one."""
-    installed, clone = (
-        Path(str(files("structgstream") / "_native" / "cuda")),
-        Path(__file__).parents[3] / "csrc" / "cuda",
-    )
+    installed = Path(str(files("structgstream") / "_native" / "cuda"))
+    clone = Path(__file__).parents[3] / "csrc" / "cuda"
     return clone if clone.is_dir() and not installed.is_dir() else installed
 
 

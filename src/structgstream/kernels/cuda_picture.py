@@ -6,7 +6,6 @@ one with gradients.
 import ctypes
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,7 +16,7 @@ from structgstream.cameras import Camera, Viewport
 from structgstream.environment import pixel_to_world
 from structgstream.errors import BackendError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.cpu_raster import shape_arguments
+from structgstream.kernels.cpu_raster import Scenery, shape_arguments
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import constant, members
 from structgstream.kernels.values import RasterOutput, TileSelection, tile_grid
@@ -221,22 +220,15 @@ class _Raster:
         call.library.call("sgs_cuda_raster_new", *places, device=device)
 
 
-@dataclass(frozen=True)
-class _Scenery:
-    """The arguments of a drawing except Gaussians."""
-
-    library: KernelLibrary
-    viewport: Viewport
-    background: Tensor | None
-    tiles: Tensor | None
-    intervals: Tensor | None
-    trained: int
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, scenery: _Scenery, onto: Tensor | None, screen_offsets: Tensor | None, *gaussians: Tensor
+        ctx: Any,
+        library: KernelLibrary,
+        scenery: Scenery,
+        onto: Tensor | None,
+        screen_offsets: Tensor | None,
+        *gaussians: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``gaussians``: means, quaternions, scales, opacities and colours."""
         means, viewport, trained = gaussians[0], scenery.viewport, scenery.trained
@@ -246,7 +238,7 @@ class _Rasterize(torch.autograd.Function):
         alpha, radii = means.new_empty(size), means.new_empty(len(means))
         if onto is not None:
             ctx.mark_dirty(onto)
-        call, rows = _Call(scenery.library), (*gaussians, scenery.intervals, screen_offsets)
+        call, rows = _Call(library), (*gaussians, scenery.intervals, screen_offsets)
         sets = [
             _Gaussians(*call.at(*(None if tensor is None else tensor[part] for tensor in rows), None), count)
             for part, count in ((slice(trained), trained), (slice(trained, None), len(means) - trained))
@@ -280,7 +272,7 @@ class _Rasterize(torch.autograd.Function):
         written = _Gradients(*library.addresses(*found, offsets))
         given = ctx.raster.address, to_image, to_alpha, ctypes.addressof(written)
         library.call("sgs_cuda_raster_backward", *given, device=image.device)
-        return None, None, offsets, *found
+        return None, None, None, offsets, *found
 
 
 def rasterize(
@@ -320,14 +312,7 @@ def rasterize(
     if onto is not None:
         assert onto.is_contiguous()
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
-    count = len(gaussians)
-    scenery = _Scenery(
-        library,
-        viewport,
-        constant(background),
-        None if tiles is None else tiles.mask.contiguous(),
-        constant(gaussians.sampling_intervals),
-        count if trained is None else min(trained, count),
-    )
+    scenery = Scenery.of(gaussians, viewport, background, tiles, trained)
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
-    return RasterOutput(*_Rasterize.apply(scenery, onto, offsets, *(tensor.contiguous() for tensor in tensors)))  # type: ignore[misc]
+    leaves = onto, offsets, *(tensor.contiguous() for tensor in tensors)
+    return RasterOutput(*_Rasterize.apply(library, scenery, *leaves))  # type: ignore[misc]

@@ -7,15 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, interpolate, max_pool2d
 
-from structgstream.kernels.values import (
-    Lifted,
-    Neighbors,
-    SweepView,
-    Swept,
-    TileSelection,
-    ViewFlows,
-    tile_pixels,
-)
+from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows, tile_pixels
 
 
 def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:

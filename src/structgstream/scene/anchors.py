@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Anchor points, the structured part of a scene (paper, section Structured 3DGs)."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -51,10 +51,8 @@ class AnchorCloud:
 
     def with_rows(self, rows: Tensor, other: "AnchorCloud") -> "AnchorCloud":
         """A copy in which the anchors of the mask ``rows`` ``[M]`` are replaced by ``other``."""
-        rows, columns = (
-            row_indices(rows, self.positions),
-            {name: column.clone() for name, column in self._columns().items()},
-        )
+        rows = row_indices(rows, self.positions)
+        columns = {name: column.clone() for name, column in self._columns().items()}
         for name, column in columns.items():
             column[rows] = getattr(other, name)
         return AnchorCloud(**columns)
@@ -64,4 +62,4 @@ class AnchorCloud:
         return AnchorCloud(**{name: torch.cat([rows, getattr(other, name)]) for name, rows in self._columns().items()})
 
     def _columns(self) -> dict[str, Tensor]:
-        return {f.name: column for f in fields(self) if (column := getattr(self, f.name)) is not None}
+        return {name: column for name, column in vars(self).items() if column is not None}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians, which represent what the anchors cannot (paper, Global Free 3DGs Patching Strategy)."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -63,14 +63,12 @@ class FreeGaussians:
     def select(self, rows: Tensor) -> "FreeGaussians":
         """The rows of a mask ``[F]`` or of indices ``[f]``."""
         rows = row_indices(rows, self.means)
-        return FreeGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return FreeGaussians(**{name: column[rows] for name, column in vars(self).items()})
 
     def to(self, device: torch.device) -> "FreeGaussians":
         """The same on ``device``."""
-        return FreeGaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return FreeGaussians(**{name: column.to(device) for name, column in vars(self).items()})
 
     def append(self, other: "FreeGaussians") -> "FreeGaussians":
         """These rows, then those of ``other``."""
-        return FreeGaussians(
-            **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
-        )
+        return FreeGaussians(**{name: torch.cat([rows, getattr(other, name)]) for name, rows in vars(self).items()})

@@ -62,22 +62,21 @@ def draw(
             and ``screen_offsets`` of the result cover only ``gaussians``.
         background: ``[3]`` background colour; None for black.
     """
-    means, count = gaussians.means, len(gaussians)
-    offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
-    drawn, drawn_offsets = gaussians, offsets
-    if active is not None:
-        drawn = concatenate(gaussians, active.static)
-        if offsets is not None:
-            drawn_offsets = torch.cat([offsets, offsets.new_zeros(len(active.static), 2)])
-    output = backend.rasterize(
-        drawn,
-        camera.viewport(means),
-        background=background,
-        screen_offsets=drawn_offsets,
-        tiles=None if active is None else active.tiles,
-        onto=None if active is None else active.picture,
-        trained=None if active is None else count,
-    )
+    count, viewport = len(gaussians), camera.viewport(gaussians.means)
+    offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True) if track_screen else None
+    if active is None:
+        output = backend.rasterize(gaussians, viewport, background=background, screen_offsets=offsets)
+    else:
+        static = active.static
+        output = backend.rasterize(
+            concatenate(gaussians, static),
+            viewport,
+            background=background,
+            screen_offsets=None if offsets is None else torch.cat([offsets, offsets.new_zeros(len(static), 2)]),
+            tiles=active.tiles,
+            onto=active.picture,
+            trained=count,
+        )
     return Rendering(output.image, output.alpha, output.radii[:count], gaussians, offsets)
 
 

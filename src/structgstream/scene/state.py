@@ -279,6 +279,11 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool, samplin
     return scene_from(values, distance_input=distance_input, sampling=sampling)
 
 
+def with_state(scene: Scene, state: Mapping[FieldName, Tensor]) -> Scene:
+    """``scene`` with the tensors ``state``, and without ``anchor_intervals``."""
+    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
+
+
 def scene_from(
     values: Mapping[ParameterName, Tensor], *, distance_input: bool, sampling: RigSampling | None = None
 ) -> Scene:
@@ -311,12 +316,11 @@ def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
         if row.granularity != "anchor" or len(columns) < len(row.shape) - 1:
             raise ConfigError(f"The dynamic set has {row.name}, which the scene lacks; take it out of the set.")
         state[row.name] = scene.anchors.positions.new_zeros(len(scene.anchors), *columns)
-    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling) if missing else scene
+    return with_state(scene, state) if missing else scene
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:
     """The scene with its tensors on ``device``."""
     if device.type == "cpu":
         return scene
-    state: dict[FieldName, Tensor] = {name: value.to(device) for name, value in state_of(scene).items()}
-    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
+    return with_state(scene, {name: value.to(device) for name, value in state_of(scene).items()})

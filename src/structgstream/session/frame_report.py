@@ -4,7 +4,6 @@
 import time
 from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any, TypeVar
 
 import torch
@@ -88,6 +87,7 @@ class FrameMeter:
     ) -> FrameReport:
         """The report of a frame with a packet of ``size`` bytes, including the remarks of its task."""
         packet, state = encoded.packet, encoded.reconstruction
+        fitted = {name: value for name, value in vars(fit).items() if name not in ("scene", "seconds")}
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
             index=packet.index,
@@ -95,16 +95,8 @@ class FrameMeter:
             kind=packet.kind,
             bytes=size,
             field_bytes=packet.field_bytes,
-            train_psnr=fit.train_psnr,
             **counts(state),
-            moving=fit.moving,
-            spawned=fit.spawned,
-            pruned=fit.pruned,
-            grown=fit.grown,
-            removed=fit.removed,
-            iterations=fit.iterations,
-            counts=dict(fit.counts),
-            losses=dict(fit.losses),
+            **fitted,
             seconds={**read, **fit.seconds, **self._seconds, "total": self._last - self._started},
             peak_memory_bytes=self._peaks.process_bytes,
             peak_device_bytes=self._peaks.device_bytes,
@@ -116,13 +108,11 @@ class FrameMeter:
 
 def metered(items: Iterator[T], device: torch.device) -> Iterator[tuple[FrameMeter, T]]:
     """Each item with the meter of its frame, whose stage ``read`` is the time until the item was available."""
-    while True:
-        meter = FrameMeter(device)
-        found = [*islice(items, 1)]
-        if not found:
-            return
+    meter = FrameMeter(device)
+    for item in items:
         meter.end("read", peak="read")
-        yield meter, found[0]
+        yield meter, item
+        meter = FrameMeter(device)
 
 
 def counts(state: Drawable) -> dict[str, int]:

@@ -34,14 +34,13 @@ class KeyFrames:
     ones."""
 
     def __init__(self, interval: int, fps: float) -> None:
-        self._interval, self._seconds = interval, (interval - _SAME) / fps
+        self.interval, self._seconds = interval, (interval - _SAME) / fps
         self._key: tuple[int, float] | None = None
 
     def kind(self, index: int, pts_seconds: float) -> PacketKind:
         """The kind of the packet of frame ``index`` at ``pts_seconds``."""
-        if self._key is None:
-            return PacketKind.KEY
-        return PacketKind.KEY if self._ends(index - self._key[0], pts_seconds - self._key[1]) else PacketKind.DELTA
+        ends = self._key is None or self._ends(index - self._key[0], pts_seconds - self._key[1])
+        return PacketKind.KEY if ends else PacketKind.DELTA
 
     def near(self, index: int, pts_seconds: float, *, within: int) -> bool:
         """Whether a key frame comes within ``within`` frames after frame ``index``, at the frame rate of this group."""
@@ -52,14 +51,9 @@ class KeyFrames:
         return self._ends(frames + within, seconds + within * spacing)
 
     @property
-    def interval(self) -> int:
-        """Frames of a group without skipped frames."""
-        return self._interval
-
-    @property
     def least(self) -> int:
         """Smallest number of frames in a group."""
-        return min(self._interval, MIN_FRAMES)
+        return min(self.interval, MIN_FRAMES)
 
     def ahead(self, index: int, pts_seconds: float, *, spacing: float) -> Iterator[int]:
         """Distances of the next key frames from frame ``index``, in frames; frames come every ``spacing`` seconds."""
@@ -77,7 +71,7 @@ class KeyFrames:
 
     def _ends(self, frames: int, seconds: float) -> bool:
         """Whether a group with this number of frames and this duration ends here."""
-        return frames >= self._interval or (frames >= MIN_FRAMES and seconds >= self._seconds)
+        return frames >= self.interval or (frames >= MIN_FRAMES and seconds >= self._seconds)
 
 
 @dataclass(frozen=True)

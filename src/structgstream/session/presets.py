@@ -279,10 +279,7 @@ RIG = StreamConfig(
 """The paper's online method on any rig: exposures are equalised, frame 0's learning rates decay and it starts on
 reduced pictures, and the number of free Gaussians, unbounded in the paper, is bounded."""
 
-MOTION = replace(
-    RIG,
-    online=replace(RIG.online, motion=MotionConfig(enabled=True)),
-)
+MOTION = replace(RIG, online=replace(RIG.online, motion=MotionConfig(enabled=True)))
 """As RIG, but only dynamic primitives are trained. F_Sigma is fixed, because static anchors depend on it."""
 
 COMPACT = replace(

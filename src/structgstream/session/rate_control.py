@@ -163,14 +163,14 @@ class RateController:
         """Number of packets of a window at the present spacing."""
         return min(max(round(self._window / self._spacing), self._keys.least, 2), self._window)
 
-    def _written(self) -> list["_Written"]:
+    def _written(self) -> list[_Written]:
         """The packets of the last window."""
         packets = [*self._last]
         begin = packets[-1].place - self._window
         within = sum(1 for one in packets if one.place > begin)
         return packets[-max(within, self._keys.least, 2) :]
 
-    def _span(self, packets: Sequence["_Written"]) -> float:
+    def _span(self, packets: Sequence[_Written]) -> float:
         """Frames of the media from the first of these packets to the one after the last."""
         return packets[-1].place - packets[0].place + self._spacing if packets else 0.0
 

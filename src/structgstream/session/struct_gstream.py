@@ -26,20 +26,15 @@ from structgstream.scene.state import (
     fields_of,
     on_device,
     parameters_of,
-    scene_of,
     state_of,
     with_dynamic_fields,
+    with_state,
 )
 from structgstream.session.pipeline import FrameTask, Past, Pipeline, StreamFacts
 from structgstream.session.presets import StreamConfig, to_json
 from structgstream.session.rate_control import with_rate_control
 from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
-from structgstream.training.frame0.quantization import (
-    Sensitivity,
-    estimate_sensitivity,
-    quantize_first_frame,
-    regauge,
-)
+from structgstream.training.frame0.quantization import Sensitivity, estimate_sensitivity, quantize_first_frame, regauge
 from structgstream.training.frame0.seeding import fit_environment
 from structgstream.training.online.exposure import ExposureReference, exposure_reference
 from structgstream.training.online.fit import fit_next_frame, needs_older
@@ -59,11 +54,9 @@ class SceneCodec:
 
     @property
     def name(self) -> str:
-        """The value of the header's ``codec``."""
         return self.config.codec
 
     def key_interval(self, fps: float) -> int:
-        """Frames from one key packet to the next."""
         return self.config.key_interval(fps)
 
     def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[FileSink, StreamReader | None]:
@@ -78,7 +71,7 @@ class SceneCodec:
         return FileSink.resume(path) if resume else (sink, None)
 
     def coder(self, header: StreamHeader, device: torch.device) -> SceneEncoder:
-        """The encoder of the stream, on the CPU."""
+        """The encoder of the stream; it decodes on the CPU."""
         return SceneEncoder(header)
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
@@ -137,7 +130,7 @@ class SceneCodec:
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.STEP)
         rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        return scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling), init_steps
+        return with_state(scene, rounded), init_steps
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
         """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
@@ -201,11 +194,10 @@ class StructGStream:
         return self._with_environment(fit, task)
 
     def _with_environment(self, fit: FitResult[Scene], task: FrameTask) -> FitResult[Scene]:
-        config, backend = self.config, task.backend
-        if not config.environment.enabled:
+        config = self.config.environment
+        if not config.enabled:
             return fit
-        views = task.pictures.views
-        found = fit_environment(fit.scene, views, config=config.environment, backend=backend)
+        found = fit_environment(fit.scene, task.pictures.views, config=config, backend=task.backend)
         return replace(fit, scene=replace(fit.scene, environment=found))
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:

@@ -9,8 +9,8 @@ from torch import Tensor
 from structgstream.errors import MissingExtraError
 
 
-def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows and distances ``[P, N]`` of the ``count`` (or all) nearest ``among`` to each of ``points`` ``[P, 3]``.
+def kd_tree(points: Tensor) -> Any:
+    """SciPy's ``KDTree`` of ``points`` ``[P, 3]``, float64.
 
     Raises:
         MissingExtraError: SciPy is not installed.
@@ -19,11 +19,18 @@ def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
         from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
-    count = min(count, len(among))
-    ranks: Any = list(range(1, count + 1))  # A list, so that the result has two dimensions even for one neighbour.
-    tree = KDTree(among.detach().double().numpy(force=True))
-    wanted = points.detach().double().numpy(force=True)
-    distances, rows = tree.query(wanted, k=ranks, workers=torch.get_num_threads())
+    return KDTree(points.double().numpy(force=True))
+
+
+def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rows and distances ``[P, N]`` of the ``count`` (or all) nearest ``among`` to each of ``points`` ``[P, 3]``.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
+    ranks = list(range(1, min(count, len(among)) + 1))  # A list: one neighbour has two dimensions, too.
+    wanted = points.double().numpy(force=True)
+    distances, rows = kd_tree(among).query(wanted, k=ranks, workers=torch.get_num_threads())
     return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
 
 

@@ -297,8 +297,7 @@ class LastPass:
     @property
     def terms(self) -> dict[str, float]:
         """Mean of each loss term."""
-        names = dict.fromkeys(
-            name for terms in self._terms.values() for name in terms
-        )  # Not every view has every term.
+        # Not every view has every term.
+        names = dict.fromkeys(name for terms in self._terms.values() for name in terms)
         by_name = {name: [terms[name] for terms in self._terms.values() if name in terms] for name in names}
         return {name: float(torch.stack(values).mean()) for name, values in by_name.items()}

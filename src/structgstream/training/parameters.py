@@ -19,10 +19,10 @@ from structgstream.scene.state import (
     ParameterName,
     parameters_of,
     scene_from,
-    scene_of,
     state_of,
     tensor_of,
     trainable,
+    with_state,
 )
 
 
@@ -160,5 +160,4 @@ class Parameters:
 
 def detached(scene: Scene) -> Scene:
     """The same scene without a gradient graph."""
-    state: dict[FieldName, Tensor] = {name: value.detach().contiguous() for name, value in state_of(scene).items()}
-    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
+    return with_state(scene, {name: value.detach().contiguous() for name, value in state_of(scene).items()})

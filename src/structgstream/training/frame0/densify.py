@@ -117,7 +117,7 @@ class NewAnchors:
         if len(self) <= count:
             return self
         rows = self.strengths.argsort(descending=True, stable=True)[: max(count, 0)].sort().values
-        return NewAnchors(self.positions[rows], self.cell_sizes[rows], self.features[rows], self.strengths[rows])
+        return NewAnchors(**{name: column[rows] for name, column in vars(self).items()})
 
 
 class FreshCells(NamedTuple):
@@ -197,12 +197,8 @@ def grow(
     if not added:
         none = means.new_zeros(0)
         return NewAnchors(means[:0], none, anchors.features[:0], none)
-    return NewAnchors(
-        torch.cat([new.positions for new in added]),
-        torch.cat([new.cell_sizes for new in added]),
-        torch.cat([new.features for new in added]),
-        torch.cat([new.strengths for new in added]),
-    ).strongest(most - len(anchors))
+    together = {name: torch.cat([getattr(new, name) for new in added]) for name in vars(added[0])}
+    return NewAnchors(**together).strongest(most - len(anchors))
 
 
 def _new_cells(means: Tensor, features: Tensor, strengths: Tensor, *, occupied: Tensor, cell: float) -> NewAnchors:

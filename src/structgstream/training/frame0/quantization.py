@@ -28,7 +28,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, scene_of, state_of
+from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, state_of, with_state
 from structgstream.training.parameters import RoundingConfig
 
 SENSITIVITY_FIELDS: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
@@ -66,7 +66,7 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
     used = torch.zeros(state["anchor_offsets"].shape[:2], dtype=torch.bool, device=products.device)
     count = 0
     for name in rig.training:
-        open_scene = scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
+        open_scene = with_state(scene, state)
         structured = open_scene.structured(rig[name], backend)
         used[structured.anchors] |= structured.raw_opacities > 0
         behind = open_scene.background(rig[name])
@@ -75,9 +75,8 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
         if not image.requires_grad:  # Nothing is drawn.
             continue
         signs = (torch.randint(0, 2, image.shape, generator=generator) * 2 - 1).to(image)
-        found = torch.autograd.grad(
-            (image * signs).sum(), [state[field] for field in SENSITIVITY_FIELDS], allow_unused=True
-        )
+        leaves = [state[field] for field in SENSITIVITY_FIELDS]
+        found = torch.autograd.grad((image * signs).sum(), leaves, allow_unused=True)
         for field, gradient in zip(SENSITIVITY_FIELDS, found, strict=True):
             if gradient is not None:
                 squares[field] += gradient.square()
@@ -181,7 +180,7 @@ def quantize_first_frame(
             step = config.at_quality(key) if row.init_step else steps.get(name, config.at_quality(key))
             found[name] = float32(step)
             state[name] = round_straight_through(state[name], found[name])
-    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling), found
+    return with_state(scene, state), found
 
 
 def _quantize_rows(

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from structgstream.environment import pixel_directions
-from structgstream.errors import CaptureError, MissingExtraError
+from structgstream.errors import CaptureError
 from structgstream.harmonics import sh_basis
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
@@ -36,7 +36,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.frame0.densify import fresh_cells
-from structgstream.training.neighbours import nearest
+from structgstream.training.neighbours import kd_tree, nearest
 from structgstream.training.views import View
 
 
@@ -47,12 +47,8 @@ def voxel_centers(points: Tensor, voxel_size: float) -> Tensor:
 
 def neighbor_distances(points: Tensor) -> Tensor:
     """Root of the mean squared distance of each point to its three nearest neighbours, ``[M]``."""
-    try:
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("scipy", "capture") from error
-    values = points.double().numpy(force=True)
-    distances, _ = KDTree(values).query(values, k=min(4, len(values)))
+    tree = kd_tree(points)
+    distances, _ = tree.query(tree.data, k=min(4, len(points)))
     squared = np.square(np.atleast_2d(distances)[:, 1:]).mean(axis=1)
     return torch.from_numpy(np.sqrt(np.maximum(squared, 1e-7))).to(points)
 

@@ -6,12 +6,7 @@ from typing import ClassVar, Literal
 
 from structgstream.cameras import NEAR_IN_RIG_RADII
 from structgstream.errors import ConfigError
-from structgstream.scene.state import (
-    PAPER_DYNAMIC,
-    STATE_TABLE,
-    FieldName,
-    ParameterName,
-)
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.losses import LossWeights
 from structgstream.training.parameters import RoundingConfig
 
@@ -152,11 +147,6 @@ class ThinSpawnConfig:
     )
     """Of the pictures 0.0005 lack something where a pitcher pours; more than 0.02 is light that changed."""
 
-    @property
-    def rules(self) -> SpawnRules:
-        """The rules of the second sweep."""
-        return replace(self.RULES, overflow=self.overflow)
-
 
 @dataclass(frozen=True)
 class SpawnConfig:
@@ -185,9 +175,8 @@ class SpawnConfig:
     @property
     def thin_rules(self) -> SpawnRules:
         """The rules of the second sweep."""
-        rules = self.thin.rules
-        share = self.missing_threshold / self.RULES.missing_threshold
-        return replace(rules, missing_threshold=share * rules.missing_threshold)
+        rules, share = self.thin.RULES, self.missing_threshold / self.RULES.missing_threshold
+        return replace(rules, overflow=self.thin.overflow, missing_threshold=share * rules.missing_threshold)
 
 
 @dataclass(frozen=True)

@@ -280,12 +280,11 @@ def _frame(adam: Adam[ParameterName], plan: FitPlan, hooks: OnlineHooks, done: i
         step = hooks.parameters.steps.get(name, 0.0)
         return FitLeaf(value.detach(), adam.first[name], adam.second[name], sums, before, step)
 
-    appears = scene.anchors.appearance is not None
     sampling, free_means = scene.sampling, values["free_means"].detach()
     return FitFrame(
         leaves=[leaf(name) for name in LEAVES],
         mlps=scene.mlps,
-        basis=scene.appearance_basis if appears else None,
+        basis=None if scene.anchors.appearance is None else scene.appearance_basis,
         distance_input=scene.distance_input,
         anchor_intervals=scene.anchor_intervals,
         # Free Gaussians, too, move by far less than their depth.

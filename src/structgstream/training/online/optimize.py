@@ -24,12 +24,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import OnlineConfig, online_rates
-from structgstream.training.online.iterations import (
-    OnlineHooks,
-    StartingPoint,
-    minimize_natively,
-    unknown_natively,
-)
+from structgstream.training.online.iterations import OnlineHooks, StartingPoint, minimize_natively, unknown_natively
 from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness

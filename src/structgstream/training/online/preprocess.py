@@ -320,14 +320,9 @@ def _box(mask: Mask, context: int) -> list[Box]:
     flow search."""
     if not mask.any():
         return []
-    spans = []
-    for axis in (1, 0):
-        hit = np.flatnonzero(mask.any(axis))
-        low, high = int(hit[0]) - context, int(hit[-1]) + 1 + context
-        spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
-    if min(span.stop - span.start for span in spans) < 2 * context:
-        return []
-    return [(spans[0], spans[1])]
+    rows, columns = (np.flatnonzero(mask.any(axis)).tolist() for axis in (1, 0))
+    edges = (rows[0] - context, rows[-1] + 1 + context, columns[0] - context, columns[-1] + 1 + context)
+    return _searchable([_within(edges, mask.shape)], context)
 
 
 def _boxes(mask: Mask, context: int) -> list[Box]:
@@ -342,7 +337,12 @@ def _boxes(mask: Mask, context: int) -> list[Box]:
     found = [_within((context * a, context * b, context * c, context * d), mask.shape) for a, b, c, d in _parts(cells)]
     if not one or sum(map(_area, found)) > MIN_SAVING * _area(one[0]):
         return one
-    return [box for box in found if min(span.stop - span.start for span in box) >= 2 * context]
+    return _searchable(found, context)
+
+
+def _searchable(boxes: list[Box], context: int) -> list[Box]:
+    """Those of ``boxes`` that are not too small for the flow search."""
+    return [box for box in boxes if min(span.stop - span.start for span in box) >= 2 * context]
 
 
 def _far_boxes(changed: Mask, consistent: Mask, cell: int) -> list[Box]:

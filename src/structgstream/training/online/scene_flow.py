@@ -32,14 +32,7 @@ from structgstream.training.online.measure import (
 from structgstream.training.online.preprocess import flow_map
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import recorded
-from structgstream.training.views import (
-    View,
-    blackened,
-    by_size,
-    evidence_views,
-    stacked_colors,
-    stacked_masks,
-)
+from structgstream.training.views import View, blackened, by_size, evidence_views, stacked_colors, stacked_masks
 
 NEIGHBOURS = 12
 """Number of nearest primitives, including itself, to whose flow a displacement is fitted."""

@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from structgstream.cameras import Camera, Viewport
-from structgstream.errors import MissingExtraError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import SweepView, TileSelection
@@ -25,6 +24,7 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
+from structgstream.training.neighbours import kd_tree
 from structgstream.training.online.config import SpawnConfig, SpawnRules
 from structgstream.training.online.measure import VISIBLE_PIXELS, slot_count
 from structgstream.training.online.split import DynamicSplit, changed_tiles
@@ -115,7 +115,8 @@ def spawn_by_sweep(
         points, spacings = (local - viewmat[:3, 3]) @ viewmat[:3, :3], step * z / K[0, 0]
         values.append(torch.cat([points, view.colors[rows, columns], spacings[:, None]], dim=1))
         costs.append(swept.costs)
-    none, like = Spawned(FreeGaussians.empty(views[0].colors)), views[0].colors
+    like = views[0].colors
+    none = Spawned(FreeGaussians.empty(like))
     if not values:
         return none
     found, cost = on_processor(torch.cat(values), torch.cat(costs))  # Where points are merged.
@@ -141,14 +142,8 @@ def _merge_points(
     points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
 ) -> Spawned:
     """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it; on the processor."""
-    try:
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("scipy", "capture") from error
     values, spacing = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
-    voxel = spacing
-    tree = KDTree(points.double().numpy())
-    finest = None
+    tree, voxel, finest = kd_tree(points), spacing, None
     while True:
         means, hits = _cells(values, tree, voxel)
         enough = hits >= rules.min_hits
@@ -164,7 +159,6 @@ def _merge_points(
         voxel *= 2.0**0.5  # Too many: what is missing is large, and coarser Gaussians fill it.
     order = hits.argsort(descending=True, stable=True)
     chosen = order[enough[order]][: rules.most].sort().values
-    count = len(chosen)
     centers, looks, sizes = means[chosen].split([3, 3, 1], dim=1)
     sizes = sizes * (voxel / spacing)
     return Spawned(
@@ -175,8 +169,8 @@ def _merge_points(
             opacity=rules.opacity,
             first_identity=first_identity,
         ),
-        refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
-        merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
+        refused_count=wanted - len(chosen) if rules.overflow == "small-clusters" else 0,
+        merged_count=max(0, finest - len(chosen)) if rules.overflow == "coarser" else 0,
     )
 
 
@@ -185,9 +179,8 @@ def _in_small_clusters(means: Tensor, reach: float, *, most: int) -> Tensor:
     ``most`` points; points nearer than ``reach`` are in one cluster."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
 
-    pairs = KDTree(means.double().numpy(force=True)).query_pairs(reach, output_type="ndarray")
+    pairs = kd_tree(means).query_pairs(reach, output_type="ndarray")
     near = coo_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(means), len(means)))
     _, cluster = connected_components(near, directed=False)
     sizes = np.bincount(cluster)
