@@ -36,7 +36,7 @@ ENOUGH = 6000
 texture, people who move about add keypoints."""
 
 
-WORKERS = os.cpu_count() or 1  # threads
+WORKERS = min(os.cpu_count() or 1, 16)  # threads, each of which holds the pyramid of a picture
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
