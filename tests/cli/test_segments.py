@@ -249,7 +249,8 @@ def test_ctrl_c_finishes_the_frame_in_all_and_resume_without_a_word_on_segments_
         said = run(asked(out), status=130)
     error = " ".join(said.err.split())
     assert "has 2 of 3 frames in all qualities; continue with the same command and --resume" in error
-    lines = [line.split("  ")[:2] for line in said.out.splitlines() if line.startswith("frame ")]
+    # Without those of iterations, which come where a frame takes long.
+    lines = [line.split("  ")[:2] for line in said.out.splitlines() if line.startswith("frame ") and "  " in line]
     assert lines == [[f"frame {number}/3", name] for number in (1, 2) for name in NAMES]
     for name in NAMES:
         manifest = read_manifest(FolderStore(out / name))
