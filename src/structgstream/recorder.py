@@ -180,7 +180,7 @@ PREVIEW_WIDTH: Final = 320
 
 
 class _ForwardingSink:
-    """Forwards a stream to ``sink``; a header as :meth:`_header` changes it."""
+    """Forwards a stream to ``sink``, each header as :meth:`_header` returns it: here unchanged."""
 
     def __init__(self, sink: PacketSink) -> None:
         self._sink = sink
@@ -195,7 +195,7 @@ class _ForwardingSink:
         self._sink.close()
 
     def _header(self, header: StreamHeader) -> StreamHeader:
-        raise NotImplementedError
+        return header
 
 
 class PreviewSink(_ForwardingSink):
