@@ -489,7 +489,22 @@ struct Backward {
               return unit < s.hidden ? a.heads[h].w1[unit * s.inputs + input_first + o] : 0.0f;
           }) {}
     bool uses(int h) const { return trained[h] || to_inputs; }
+    // One more than the anchor of an active row, 0 before the first.
+    int64_t end_of(int64_t row) const { return row < 0 ? 0 : a.visible[selection.active[row]] + 1; }
 };
+
+// Sets the gradients of the anchors first ... end - 1 to zero.
+void clear_rows(const Backward& b, int64_t first, int64_t end) {
+    const auto clear = [=](float* rows, int width) {
+        if (rows != nullptr) std::memset(rows + first * width, 0, sizeof(float) * width * (end - first));
+    };
+    if (first == end) return;
+    clear(b.to.positions, 3);
+    clear(b.to.log_offset_scales, 3);
+    clear(b.to.log_base_scales, 3);
+    clear(b.to.offsets, 3 * b.s.k);
+    clear(b.to.features, b.s.d);
+}
 
 // From gradients of a block's Gaussians to gradients of the heads' outputs (before activation) and of the anchors.
 [[gnu::noinline]] void gather(
@@ -503,6 +518,7 @@ struct Backward {
     for (int l = 0; l < block.count; ++l) {
         const int64_t first_id = block.anchors[l] * k;
         float mean_sum[3] = {}, reach_sum[3] = {}, base_sum[3] = {};
+        if (b.to.offsets != nullptr) std::memset(b.to.offsets + first_id * 3, 0, sizeof(float) * 3 * k);
         for (int64_t g = b.selection.starts[begin + l]; g < b.selection.starts[begin + l + 1]; ++g) {
             const int j = static_cast<int>(b.drawn.ids[g] - first_id);
             const float* offset = b.a.offsets + b.drawn.ids[g] * 3;
@@ -584,6 +600,7 @@ void block_backward(const Backward& b, int begin, int count, float* rows, float*
         row_of(rows, b.at.outputs[0]), row_of(rows, b.at.outputs[1]), row_of(rows, b.at.outputs[2])};
     const Block block = active_block(b.a, b.selection, begin, count);
     x.read(b.a, s, block);
+    for (int l = 0; l < count; ++l) clear_rows(b, b.end_of(begin + l - 1), block.anchors[l]);
     gather(b, begin, block, outputs, means);
     for (int h = 0; h < kHeads; ++h) {
         if (!b.uses(h)) continue;
@@ -667,6 +684,7 @@ void anchors_backward(
             add_weights(b, memory.get(), blocks, sums + group * size);
         }
     }
+    clear_rows(b, b.end_of(total - 1), to.anchors);
     for (int group = 1; group < groups; ++group)
         for (size_t i = 0; i < size; ++i) sums[i] += sums[group * size + i];
     write_weights(b, sums);

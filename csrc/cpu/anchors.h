@@ -64,8 +64,9 @@ struct sgs_gaussian_gradients {
     const float* colors;
 };
 
-// Any pointer may be null: that gradient is not computed. Rows of anchors that are not active are not written.
+// Any pointer may be null: that gradient is not computed. Rows of anchors that are not active are set to zero.
 struct sgs_anchor_gradients {
+    int64_t anchors;  // rows of the arrays
     float* positions;
     float* log_offset_scales;
     float* log_base_scales;

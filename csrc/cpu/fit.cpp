@@ -254,14 +254,12 @@ class Fit {
     float* gradient(int leaf) { return f_.leaves[leaf].first ? gradients_[leaf].data() : nullptr; }
 
     void generate_backward() {
-        for (int n = kPositions; n <= kFeatures; ++n) std::fill(gradients_[n].begin(), gradients_[n].end(), 0.0f);
-        std::fill(to_folded_.begin(), to_folded_.end(), 0.0f);
         const bool folds = f_.basis && (gradient(kAppearance) || gradient(kFeatures));
         const sgs_gaussian_gradients from{
             to_drawn_.means.data(), to_drawn_.quats.data(), to_drawn_.scales.data(), to_drawn_.opacities.data(),
             to_drawn_.colors.data()};
         const sgs_anchor_gradients to{
-            gradient(kPositions), gradient(kOffsetScales), gradient(kBaseScales), gradient(kOffsets),
+            f_.anchors, gradient(kPositions), gradient(kOffsetScales), gradient(kBaseScales), gradient(kOffsets),
             folds ? to_folded_.data() : gradient(kFeatures), {}};
         const sgs_gaussians drawn = gaussians();
         sgs_anchors_backward(&anchors_, &selection_, &drawn, &from, &to, threads_);

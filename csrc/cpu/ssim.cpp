@@ -297,20 +297,25 @@ void l1_ssim(const Pictures& pictures, const Part* parts, int count, float* grad
 void l1_ssim_backward(
     const Pictures& p, const Part* parts, int count, const float* ssim_gradient, float l1_scale, float ssim_scale,
     float* gradient, int threads) {
+    std::vector<float> gains(p.width * kChannels, 1.0f), biases(p.width * kChannels, 0.0f);  // of the numbers of a row
+    if (p.gains != nullptr)
+        for (int i = 0; i < p.width * kChannels; ++i) gains[i] = p.gains[i % kChannels], biases[i] = p.biases[i % kChannels];
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1 && count > 1)
     for (int n = 0; n < count; ++n) {
         const Part& part = parts[n];
         for (int row = part.top; row < part.bottom; ++row) {
-            const size_t last = (static_cast<size_t>(row) * p.width + part.right) * kChannels;
-            for (size_t i = (static_cast<size_t>(row) * p.width + part.left) * kChannels; i < last; i += kChannels) {
-                for (int c = 0; c < kChannels; ++c) {
-                    const float y = p.target != nullptr ? p.target[i + c] : static_cast<float>(p.target_u8[i + c]) / 255.0f;
-                    const float gain = p.gains != nullptr ? p.gains[c] : 1.0f;
-                    const float x = p.gains != nullptr ? p.image[i + c] * gain + p.biases[c] : p.image[i + c];
-                    const float sign = static_cast<float>((x > y) - (x < y));
-                    gradient[i + c] = gain * l1_scale * sign + ssim_scale * ssim_gradient[i + c];
+            const size_t first = static_cast<size_t>(row) * p.width * kChannels;
+            const auto give = [&](auto target) {
+                for (int i = part.left * kChannels; i < part.right * kChannels; ++i) {
+                    const float y = target(first + i), x = p.image[first + i] * gains[i] + biases[i];
+                    const float sign = static_cast<float>(x > y) - static_cast<float>(x < y);
+                    gradient[first + i] = gains[i] * l1_scale * sign + ssim_scale * ssim_gradient[first + i];
                 }
-            }
+            };
+            if (p.target != nullptr)
+                give([&](size_t i) { return p.target[i]; });
+            else
+                give([&](size_t i) { return static_cast<float>(p.target_u8[i]) / 255.0f; });
         }
     }
 }

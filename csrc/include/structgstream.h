@@ -13,7 +13,7 @@ extern "C" {
 
 /* Version of the library's interface. It is incremented with every change of the declarations in this file or in
  * cpu/anchors.h. kernels/native.py requires the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 10
+#define SGS_ABI_VERSION 11
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */

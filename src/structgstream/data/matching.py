@@ -81,8 +81,8 @@ def back_project(camera: Camera, pixels: Floats, depths: Floats) -> Floats:
 
 def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> NDArray[np.bool_]:
     """Which projections ``[...]`` fall into the picture, beyond ``near``."""
-    size = (camera.width, camera.height)
-    return (depths > near) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+    x, y = pixels[..., 0], pixels[..., 1]
+    return (depths > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
 def viewing_distance(cameras: Mapping[str, Camera]) -> float:

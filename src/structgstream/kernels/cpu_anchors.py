@@ -47,6 +47,7 @@ class _GaussianGradients(ctypes.Structure):
 
 class _AnchorGradients(ctypes.Structure):
     _fields_ = [
+        ("anchors", ctypes.c_int64),
         *members(ctypes.c_void_p, "positions log_offset_scales log_base_scales offsets features"),
         ("heads", _Head * 3),
     ]
@@ -107,9 +108,7 @@ class _Generate(torch.autograd.Function):
         # The four tensors of a head are trained or frozen together; the C++ writes whole heads.
         head_wanted = [any(wanted[5 + 4 * head : 9 + 4 * head]) for head in range(3)]
         results = [
-            (torch.zeros_like(tensor) if index < 5 else torch.empty_like(tensor))
-            if (wanted[index] if index < 5 else head_wanted[(index - 5) // 4])
-            else None
+            torch.empty_like(tensor) if (wanted[index] if index < 5 else head_wanted[(index - 5) // 4]) else None
             for index, tensor in enumerate(tensors)
         ]
         native_library().sgs_anchors_backward(
@@ -117,7 +116,7 @@ class _Generate(torch.autograd.Function):
             ctypes.byref(_Selection(*addresses(raw, bits, active, starts), active_count, ids.shape[0])),
             ctypes.byref(_Gaussians(*addresses(*drawn, ids, norms))),
             ctypes.byref(_GaussianGradients(*addresses(*given))),
-            ctypes.byref(_AnchorGradients(*addresses(*results[:5]), native_heads(results[5:]))),
+            ctypes.byref(_AnchorGradients(len(tensors[0]), *addresses(*results[:5]), native_heads(results[5:]))),
             torch.get_num_threads(),
         )
         return None, None, None, *(result if want else None for result, want in zip(results, wanted, strict=True))

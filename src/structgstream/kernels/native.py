@@ -16,7 +16,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 
-ABI_VERSION = 10
+ABI_VERSION = 11
 """Equal to the version in csrc/include/structgstream.h, which states when it is incremented."""
 ISA_NAMES = ("baseline", "avx2", "avx512")
 TYPES: Mapping[str, Any] = {
