@@ -4,14 +4,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check python-test viewer-test player wheel wheel-test docs lab-test tables clean
+.PHONY: demo test check python-test tables-test viewer-test player wheel wheel-test docs lab-test tables clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
 
 # The first two parts run beside each other, and print when they end. The viewer's run alone: browsers play in real time.
 test: $(VENV)/.test-ready
-	@$(MAKE) --no-print-directory --jobs=$$(nproc 2> /dev/null || echo 1) --output-sync=target check python-test
+	@$(MAKE) --no-print-directory --jobs=$$(nproc 2> /dev/null || echo 1) --output-sync=target check python-test tables-test
 	scripts/viewer-test --if-node
 
 check: $(VENV)/.test-ready
@@ -19,6 +19,10 @@ check: $(VENV)/.test-ready
 
 python-test: $(VENV)/.test-ready
 	scripts/test $(BIN)
+
+# The tables of the notes are those of the results beside them, and these of the present configurations.
+tables-test: $(VENV)/.test-ready
+	PYTHONPATH=lab/studies/src $(BIN)/python -m pytest -c lab/pytest.ini --rootdir . lab/tests/studies/experiments/test_documents.py lab/tests/studies/experiments/test_present.py
 
 viewer-test:
 	scripts/viewer-test

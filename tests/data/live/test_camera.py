@@ -68,7 +68,13 @@ def clock(base: TimeBase, *, offset_seconds: float = 0.0) -> ClockMapper:
 
 
 def camera_feed(
-    received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, tick: float = PERIOD / 2, **options: Any
+    received: Received,
+    *,
+    base: TimeBase,
+    camera: LiveCamera = NOWHERE,
+    tick: float = PERIOD / 2,
+    unix_offset: float = 1000.0,
+    **options: Any,
 ) -> tuple[CameraFeed, FaultLog]:
     """A camera of 128x96 pixels in a time of its own, ``tick`` seconds later each time it is read, and its faults."""
     ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
@@ -81,7 +87,7 @@ def camera_feed(
         resets=ClockResets(),
         faults=faults,
         now=lambda: next(ticks) * tick,
-        unix_offset=1000.0,
+        unix_offset=unix_offset,
         **options,
     )
     return feed, faults
@@ -409,9 +415,11 @@ def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:
             output.mux(stream.encode(frame))
 
 
-@pytest.mark.parametrize("form", ["rtp_mpegts", "rtp"])
-def test_a_camera_that_sends_rtp(tmp_path: Path, form: str) -> None:
-    """MPEG-TS needs its address alone; what else there is, a description of the session."""
+@pytest.mark.parametrize(
+    ("form", "base"), [("rtp_mpegts", TimeBase.ARRIVAL), ("rtp_mpegts", TimeBase.UNIX), ("rtp", TimeBase.ARRIVAL)]
+)
+def test_a_camera_that_sends_rtp(tmp_path: Path, form: str, base: TimeBase) -> None:
+    """MPEG-TS needs its address alone, and its stamps wrap; what else there is, a description of the session."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1] & ~1  # the next one is for reports
@@ -421,7 +429,7 @@ def test_a_camera_that_sends_rtp(tmp_path: Path, form: str) -> None:
     )
     url = str(tmp_path / "a.sdp") if form == "rtp" else f"rtp://127.0.0.1:{port}"
     received, ended = Received(), threading.Event()
-    feed, faults = camera_feed(received, base=TimeBase.ARRIVAL, camera=LiveCamera(url), tick=PERIOD)
+    feed, faults = camera_feed(received, base=base, camera=LiveCamera(url), tick=PERIOD, unix_offset=UNIX)
     sender = threading.Thread(target=sent_by_rtp, args=(port, form, ended))
     sender.start()
     feed.start()
@@ -434,6 +442,7 @@ def test_a_camera_that_sends_rtp(tmp_path: Path, form: str) -> None:
         feed.join(WAIT)
     numbers = received.numbers[:8]
     assert numbers == [(numbers[0] + n) % 12 for n in range(8)]
+    assert all(abs(picture.seconds - UNIX) < WRAP for picture in received.pictures)
     assert not feed.ended
     assert "gone" not in faults.counts.get("a", {})
 

@@ -140,7 +140,7 @@ NUMBER_BITS = 8
 PRECISION_BITS = 2
 COUNT_BITS = 5
 MAX_ZEROS = 8
-_MAX_ROW_BYTES = 72  # 14 bits, 32 presence flags, and 32 levels of at most 17 bits
+_MAX_ROW_BYTES = 72  # more than any valid row takes: its 32 levels are at most 17 bits each, but not all as long
 
 
 def levels_of(frequencies: NDArray[np.integer], *, precision: int) -> NDArray[np.int64]:

@@ -57,6 +57,7 @@ BACKLOG_SHARE = 0.1
 SAME_RESET_SECONDS = 0.1
 FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_WRAP_SECONDS = 2**33 / 90_000
+MPEGTS_FORMATS = ("mpegts", "rtp")  # the latter: MPEG-TS in RTP, the only RTP that an address alone describes
 MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 MAX_SOUND_APART_SECONDS = 10.0
 """Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
@@ -317,7 +318,7 @@ class CameraFeed:
             raise ValueError("its coding is unknown to the installed PyAV")
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
         self._clock.reconnect()
-        self._wrap_seconds = MPEGTS_WRAP_SECONDS if container.format.name == "mpegts" else None
+        self._wrap_seconds = MPEGTS_WRAP_SECONDS if container.format.name in MPEGTS_FORMATS else None
         stamped = self._camera.is_file or not container.format.flags & NO_TIMESTAMPS
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before, self._held, self._whole = None, [], False
