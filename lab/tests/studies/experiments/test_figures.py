@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from outcomes import outcome
-from structgstream.figure import COLORS
+from structgstream.figure import COLORS, OTHER
 from structgstream_studies.experiments.figures import (
     most_varied_crop,
     write_adjacent,
@@ -59,6 +59,13 @@ def test_methods_are_points_with_the_spread_as_bars(tmp_path: Path) -> None:
     assert coloured(picture, COLORS[0]) > 30
     left, right = np.split(picture, [picture.shape[1] // 2], axis=1)
     assert min(coloured(half, COLORS[0]) for half in (left, right)) > 15
+
+
+def test_cited_methods_are_hollow_marks_in_both_panels(tmp_path: Path) -> None:
+    write_comparison(tmp_path / "m.png", runs(), titles=TITLES)
+    picture = pixels_of(tmp_path / "m.png")
+    third = picture.shape[1] // 3  # the legend is in the last one
+    assert all(coloured(picture[:, part], OTHER) > 10 for part in (slice(third), slice(third, 2 * third)))
 
 
 def test_a_method_without_a_cost_is_left_out_and_no_cost_is_drawn_at_the_edge(tmp_path: Path) -> None:

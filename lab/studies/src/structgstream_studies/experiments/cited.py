@@ -108,6 +108,11 @@ CITED: Mapping[str, CitedTable] = {
 }
 
 
+def online_rows(name: str) -> list[CitedRow]:
+    """The online methods of a data set."""
+    return [row for row in CITED[name].rows if row.kind == _ONLINE]
+
+
 def cited_sheet(name: str) -> Sheet:
     """The table of a data set; every cell is the paper's.
 

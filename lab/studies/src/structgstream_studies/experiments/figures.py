@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.figure import COLORS, INK, figure_of, save_figure, without_frame
+from structgstream.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
+from structgstream_studies.experiments.cited import online_rows
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES
 from structgstream_studies.experiments.summary import Summary, summaries
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 Picture = NDArray[np.uint8]
 CROP_SHARE = 4  # a detail is a quarter of the picture across
 CHANGE_GAIN = 8
+CITED_DATA, CITED_MARKS = "n3dv", "sv^D"
 CURVES = ("psnr", "psnr_camera_color", "psnr_changed", "e_warp", "flicker")
 
 
@@ -46,7 +48,8 @@ def write_curves(path: Path, results: Iterable[Result], *, keys: Sequence[str], 
 
 
 def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[str, str]) -> None:
-    """Quality against bytes and against seconds, a point for each method, bars for the spread over seeds.
+    """Quality against bytes and against seconds, a point for each method, bars for the spread over seeds; hollow marks
+    for the online methods as the paper cites them on N3DV, which are of other data and a GPU's seconds.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -55,7 +58,10 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
     figure = figure_of(10.0, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
     points: dict[str, Any] = {}
-    panels = (("online_bytes", "MB a frame after the first"), ("online_cpu_seconds", "core-seconds a frame"))
+    panels = (
+        ("online_bytes", "MB a frame after the first"),
+        ("online_cpu_seconds", "core-seconds a frame; cited: seconds on a GPU"),
+    )
     for axis, (name, caption) in zip(axes, panels):
         for number, key in enumerate(key for key in titles if key in found):
             cost, quality = found[key].score(name), found[key].score("psnr")
@@ -65,6 +71,10 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
             colour = INK if key == FULL else COLORS[number % len(COLORS)]
             spread = quality.deviation
             points[titles[key]] = axis.errorbar(x, quality.mean, yerr=spread, fmt="o", color=colour, capsize=3)
+        for row, mark in zip(online_rows(CITED_DATA), CITED_MARKS):
+            x = float(row.megabytes) if name == "online_bytes" else 60.0 * float(row.minutes)
+            (point,) = axis.plot(x, float(row.psnr), mark, color=OTHER, fillstyle="none", markeredgewidth=1.6)
+            points[f"{row.method}, cited"] = point
         axis.set_xscale("log")
         axis.margins(x=0.12, y=0.12)
         axis.set_xlabel(caption, fontsize=9)
