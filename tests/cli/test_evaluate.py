@@ -36,6 +36,7 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, run: Runner) -> N
     assert content["mean"]["seconds"] > 0
     assert content["stream"]["total_bytes"] == stream.stat().st_size
     assert content["stream"]["metadata"]["scale"] == 0.25
+    assert content["stream"]["config"]["seed"] == 0
     assert content["environment"]["backend"] == QUICKEST
     assert {entry.name for entry in folder.iterdir()} == {
         "report.json", "index.html", "over_time.png", "contact_sheet.png", "worst"

@@ -197,7 +197,7 @@ def test_sizes_and_rates_by_hand() -> None:
     assert facts["megabits_per_second"] == pytest.approx(280 * 8 / 1e6 / 0.1)
     assert facts["megabits_per_second_with_header"] == pytest.approx(820 * 8 / 1e6 / 0.1)
     assert facts["cameras"] == {"cam00": "held out", "cam02": "training"}
-    assert facts["metadata"] == {"capture": "test"}
+    assert (facts["metadata"], facts["config"]) == ({"capture": "test"}, HEADER.config)
     sparse = recording([{}, {}])  # two frames 2 s apart
     sparse.packets[1] = replace(sparse.packets[1], pts_seconds=2 - 1 / 30)
     assert stream_facts(sparse, ())["megabits_per_second"] == pytest.approx(20 * 8e-6 / 2)

@@ -232,6 +232,7 @@ def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
         "megabits_per_second": packet_bytes * 8e-6 / seconds,
         "megabits_per_second_with_header": reader.total_bytes * 8e-6 / seconds,
         "metadata": dict(header.metadata),
+        "config": dict(header.config),
     }
 
 

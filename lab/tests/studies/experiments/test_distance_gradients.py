@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradients that are compared are those of the printed sum and of everything but L_dist."""
+"""The gradients that are compared are those of the printed sums and of everything but L_dist or L_vol."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.losses import InitialLossWeights, offset_distance
+from structgstream.training.losses import InitialLossWeights, offset_distance, volume
 from structgstream_studies.experiments.distance_gradients import compared
 
 VOXEL = 0.1
@@ -20,14 +20,19 @@ def test_ratios_are_those_of_the_printed_sum_whatever_is_trained(reduction: Any)
     offsets[0, 0], offsets[1, 2, 1], offsets[2] = 0.5, -0.4, 0.19  # the last one is within 2 eps
     offsets.requires_grad_()
     anchors: Any = SimpleNamespace(offsets=offsets, log_offset_scales=torch.zeros(4, 3))
-    weights = InitialLossWeights(offset_distance=0.01, offset_distance_reduction=reduction)
+    weights = InitialLossWeights(
+        offset_distance=0.01, offset_distance_reduction=reduction, volume=0.02, volume_reduction=reduction
+    )
     backend = reference_backend()
     picture = (2.0 * offsets[:1]).sum() + (4.0 * offsets[1:]).sum()
     distance = offset_distance(anchors, voxel_size=VOXEL, weights=weights, backend=backend)
+    scales, opacities = torch.tensor([[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]]).requires_grad_(), torch.tensor([0.5, 0.0])
+    drawn_scales = torch.where(opacities[:, None] > 0, scales, 0.0)
+    bulk = volume(drawn_scales, opacities, reduction=reduction, backend=backend)
     loss: Any = SimpleNamespace(
-        total=picture + weights.offset_distance * distance,
+        total=picture + 4.0 * scales.sum() + weights.offset_distance * distance + weights.volume * bulk,
         structured=SimpleNamespace(
-            anchors=torch.arange(3), gaussians=SimpleNamespace(opacities=torch.tensor([0.5, 0.0]))
+            anchors=torch.arange(3), gaussians=SimpleNamespace(opacities=opacities, scales=scales)
         ),
     )
     hooks = SimpleNamespace(
@@ -41,6 +46,8 @@ def test_ratios_are_those_of_the_printed_sum_whatever_is_trained(reduction: Any)
     assert found["median_ratio"] == pytest.approx(0.01 / 2.0)
     assert found["norm_ratio"] == pytest.approx(0.01 * 2.0 / (3 * 2.0**2 + 4.0**2) ** 0.5)
     assert (found["components"], found["anchors"], found["anchors_in_view"], found["drawn"]) == (60, 4, 3, 1)
+    assert found["volume_median_ratio"] == pytest.approx(0.02 * 3.0 / 4.0)
+    assert found["volume_norm_ratio"] == pytest.approx(0.02 * (6**2 + 3**2 + 2**2) ** 0.5 / (3 * 4.0**2) ** 0.5)
     assert found["excess_voxels"] == pytest.approx((3 * 0.3 + 0.2) / 4 / VOXEL, rel=1e-5)
 
 

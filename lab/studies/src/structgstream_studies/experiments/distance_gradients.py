@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How strong L_dist is beside the picture in frame 0: ``python -m`` this module and a capture.
+"""How strong L_dist and L_vol are beside the picture in frame 0: ``python -m`` this module and a capture.
 
 L_dist acts on the components of O * l_v beyond 2 eps. Every ``--every`` iterations the gradients by O of the printed
 sum, times its weight, and of the other terms are compared on these components: the median of the ratio over those that
 the view reaches, and the ratio of the norms. Other reductions divide the sum by a number that is counted here, too.
-Frame 0 is trained as its preset says, whatever is compared.
+L_vol is compared likewise, by the scales of the drawn Gaussians. Frame 0 is trained as its preset says, whatever is
+compared.
 """
 
 import json
@@ -18,20 +19,22 @@ from unittest.mock import patch
 
 import torch
 import tyro
+from torch import Tensor
 
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import select_backend
 from structgstream.recorder import record
 from structgstream.session.presets import preset_named
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.frame0 import fit
-from structgstream.training.losses import SceneLoss
+from structgstream.training.losses import InitialLossWeights, SceneLoss
 from structgstream.training.views import View
 from structgstream_studies.experiments.captures import CapturePart
 
 
 @dataclass(frozen=True)
 class Options:
-    """Compares the gradients of L_dist with the picture's."""
+    """Compares the gradients of L_dist and L_vol with the picture's."""
 
     capture: tyro.conf.Positional[Path]
     preset: str = "paper-n3dv"
@@ -46,10 +49,11 @@ class Options:
 
 
 def compared(hooks: Any, loss: SceneLoss) -> dict[str, float]:
-    """Counts of one iteration, and ratios of the printed sum's gradient, times its weight, to the picture's."""
+    """Counts of one iteration, and ratios of the printed sums' gradients, times their weights, to the picture's."""
     values, config = hooks.parameters.values, hooks.config
     offsets, anchors = values["anchor_offsets"], hooks.scene.anchors
-    (everything,) = torch.autograd.grad(loss.total, offsets, retain_graph=True)
+    gaussians = loss.structured.gaussians
+    everything, by_scales = torch.autograd.grad(loss.total, (offsets, gaussians.scales), retain_graph=True)
     total = hooks.backend.excess(anchors.offsets, anchors.log_offset_scales, 2.0 * config.voxel_size)
     (pull,) = torch.autograd.grad(total, offsets)
     weight = config.losses.offset_distance
@@ -66,8 +70,22 @@ def compared(hooks: Any, loss: SceneLoss) -> dict[str, float]:
         "beyond_and_reached": int(reached.sum()),
         "anchors": len(anchors),
         "anchors_in_view": len(loss.structured.anchors),
-        "drawn": int((loss.structured.gaussians.opacities > 0).sum()),
+        "drawn": (drawn := int((gaussians.opacities > 0).sum())),
         "excess_voxels": float(total.detach()) / max(int(beyond.sum()), 1) / config.voxel_size,
+    } | _volume_ratios(gaussians, by_scales, drawn, config.losses)
+
+
+def _volume_ratios(
+    gaussians: Gaussians, everything: Tensor, drawn: int, weights: InitialLossWeights
+) -> dict[str, float]:
+    """Of the printed sum of L_vol over the drawn Gaussians; ``everything`` is the loss's gradient by their scales."""
+    x, y, z = gaussians.scales.detach().unbind(1)
+    pull = weights.volume * torch.stack([y * z, x * z, x * y], 1) * (gaussians.opacities > 0)[:, None]
+    picture = everything - (pull / max(drawn, 1) if weights.volume_reduction == "mean" else pull)
+    reached = (pull != 0) & (picture != 0)
+    return {
+        "volume_median_ratio": float((pull[reached] / picture[reached].abs()).median()),
+        "volume_norm_ratio": float(pull[reached].norm() / picture[reached].norm()),
     }
 
 

@@ -68,7 +68,7 @@ def result_of(report: "Report", *, identity: Mapping[str, Any], trained_by: Mapp
         log = frame.pop("log")
         del frame["cameras"]
         frames.append(frame | {key: log[key] for key in FRAME_KEYS_OF_LOG if key in log})
-    stream = {key: value for key, value in content["stream"].items() if key != "metadata"}
+    stream = {key: value for key, value in content["stream"].items() if key not in ("metadata", "config")}
     # Which scores are missing is of the result; where this machine would have looked for them is not.
     stream["not_available"] = sorted(stream.get("not_available", ()))
     return Result(
