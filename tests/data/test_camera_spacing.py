@@ -67,6 +67,20 @@ def test_a_little_too_far_apart_is_no_warning_and_close_cameras_are_not_mentione
     assert spacing.expectation(evenly(24, 15.0)) is None
 
 
+def test_cameras_that_look_apart_are_promised_nothing() -> None:
+    """A rig in the middle of a room: 12 cameras 30 degrees apart around the same scene would give 30 dB."""
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    around = evenly(12, 30.0)
+    outward = {name: replace(camera, viewmat=turn @ camera.viewmat) for name, camera in around.items()}
+    inside, outside = spacing.expectation(around), spacing.expectation(outward)
+    assert inside is not None
+    assert not inside.poor
+    assert outside is not None
+    assert outside.poor
+    assert "12 cameras that look away from each other" in outside.sentence
+    assert " dB " not in outside.sentence
+
+
 def test_where_a_little_more_or_less_decides_it_is_a_warning() -> None:
     expected = spacing.expectation(evenly(7, 48.0))
     assert expected is not None

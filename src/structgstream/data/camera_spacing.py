@@ -75,7 +75,8 @@ class Expectation:
     """What a rig may give at viewpoints between its cameras.
 
     Args:
-        sentence: number and spacing of the cameras, and the PSNR to expect, also with more cameras.
+        sentence: number and spacing of the cameras, and the PSNR to expect, also with more cameras; or that they look
+            away from each other.
         poor: whether new viewpoints may be hardly watchable.
     """
 
@@ -94,6 +95,12 @@ def expectation(cameras: Mapping[str, Camera]) -> Expectation | None:
     degrees, count = camera_spacing(cameras), len(cameras)
     if degrees <= GOOD_DEGREES:
         return None
+    if _look_apart(cameras):
+        return Expectation(
+            f"{count} cameras that look away from each other: neighbours see the same from nearly the same side, so "
+            "depth is uncertain, and viewpoints between them may be hardly watchable; no such rig was measured.",
+            poor=True,
+        )
     low, high = expected_psnr(degrees * SPREAD), expected_psnr(degrees / SPREAD)
     enough = math.ceil(count * (degrees / GOOD_DEGREES) ** (1.0 / COUNT_EXPONENT))
     closer = {number: degrees * (count / number) ** COUNT_EXPONENT for number in (min(2 * count, enough), enough)}
@@ -105,6 +112,15 @@ def expectation(cameras: Mapping[str, Camera]) -> Expectation | None:
         f"them{torn} (about {better}); add cameras, or move them closer together.",
         poor,
     )
+
+
+def _look_apart(cameras: Mapping[str, Camera]) -> bool:
+    """Whether optical axes diverge where cameras stand apart, as in a rig in the middle of a room."""
+    centers = np.stack([camera.center.numpy() for camera in cameras.values()])
+    axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
+    apart, turned = centers[:, None] - centers, axes[:, None] - axes
+    lengths = np.linalg.norm(apart, axis=2) * np.linalg.norm(turned, axis=2)
+    return bool((apart * turned).sum() > 0.5 * lengths.sum())
 
 
 DIRECTIONS = 360
