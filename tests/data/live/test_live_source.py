@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -240,6 +241,17 @@ def test_a_resumed_stream_gets_the_pictures_that_no_camera_sends_again(tmp_path:
     assert frames[2].pts_seconds == pytest.approx(frames[1].pts_seconds + 1 / FPS)
     with pytest.raises(CaptureError, match="cannot be resumed"):
         next(again.frames(30))
+
+
+@pytest.mark.parametrize("start", [0, 6])
+def test_the_first_frame_of_a_run_waits_for_cameras_that_still_send(tmp_path: Path, start: int) -> None:
+    source = live(files(tmp_path), held_out=())
+    sets = [["a", "b"], ["a", "b", "c"], ["a", "b"]]
+    arriving = iter(MultiViewFrame(0, 0.0, {name: np.ones((96, 128, 3), np.uint8) for name in names}) for names in sets)
+    source._taken = lambda ingest: next(arriving)  # type: ignore[method-assign]
+    ingest: Any = SimpleNamespace(end_reason=None, open_cameras={"a", "b", "c"})
+    frames = list(islice(source._arriving(ingest, start), 2))
+    assert [[*frame.images] for frame in frames] == sets[1:]
 
 
 def test_a_stream_is_stopped_between_two_frames(tmp_path: Path) -> None:

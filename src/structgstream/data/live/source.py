@@ -182,7 +182,7 @@ class LiveSource:
     def _live_frames(self, start: int) -> Iterator[MultiViewFrame]:
         pts, origin = (self._cache.last() if self._options.resume else None) or (None, None)
         with self._running() as (ingest, recording):
-            frames = self._calibrated(self._arriving(ingest, is_first=start == 0)).frames()
+            frames = self._calibrated(self._arriving(ingest, start)).frames()
             for index, frame in enumerate(frames, start):
                 times, seconds = self._times, frame.pts_seconds
                 origin = self._origin(origin, seconds, pts)
@@ -248,9 +248,11 @@ class LiveSource:
         source = with_masks(pictures, masks_folder(folder), without=self._live.without)
         return selected(source, held_out=options.held_out, scale=options.scale, near=options.near)
 
-    def _arriving(self, ingest: Ingest, *, is_first: bool) -> Iterator[MultiViewFrame]:
-        """Frames before undistortion, at times of the common clock; frame 0 (``is_first``) waits for all cameras."""
+    def _arriving(self, ingest: Ingest, start: int) -> Iterator[MultiViewFrame]:
+        """Frames ``start`` and later before undistortion, at times of the common clock; the first waits for all
+        cameras."""
         started = reported = time.monotonic()
+        is_first = True
         interval = HEARTBEAT_SECONDS
         while not self.stopped:
             # Asked before the frame, so that a set that arrives in between is not lost.
@@ -258,7 +260,7 @@ class LiveSource:
             frame = self._taken(ingest)
             now = time.monotonic()
             if frame is None:
-                if ended and is_first:
+                if ended and is_first and start == 0:
                     raise CaptureError(
                         f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {MIN_CAMERAS} training "
                         "cameras of one instant; the warnings before this say what is wrong with each camera."
@@ -277,7 +279,7 @@ class LiveSource:
             if len(frame.showing(self.rig.training)) < MIN_CAMERAS:
                 self._small_sets += 1
                 continue
-            if is_first and absent:
+            if is_first and absent and start == 0:
                 missing = ", ".join(absent)
                 log.warning("%s: frame 0 has no picture of %s, so what only they see is missing", self.name, missing)
             is_first = False
