@@ -57,7 +57,7 @@ class AblationTable:
 FULL = "full"
 ACTING_DISTANCE = 5e-6
 """Weight of the sum in L_dist at which its gradient is 0.3 to 0.8 of the picture's, where it acts
-(``distance_gradients``): the printed weight, 0.005, is a thousand times as much, and as a mean it is below 0.001."""
+(``loss_gradients``): the printed weight, 0.005, is a thousand times as much, and as a mean it is below 0.001."""
 FULL_METHODS: Mapping[str, StreamConfig] = {
     "rig": PRESETS["rig"],
     "paper-n3dv": PRESETS["paper-n3dv"],

@@ -59,7 +59,7 @@ def compared(hooks: Any, loss: SceneLoss) -> dict[str, float]:
     weight = config.losses.offset_distance
     mean = config.losses.offset_distance_reduction == "mean"
     picture = everything - pull * weight / (offsets.numel() if mean else 1)
-    beyond = pull != 0
+    beyond, drawn = pull != 0, int((gaussians.opacities > 0).sum())
     reached = beyond & (picture != 0)
     norms = [float(gradient[reached].norm()) for gradient in (weight * pull, picture)]
     return {
@@ -70,7 +70,7 @@ def compared(hooks: Any, loss: SceneLoss) -> dict[str, float]:
         "beyond_and_reached": int(reached.sum()),
         "anchors": len(anchors),
         "anchors_in_view": len(loss.structured.anchors),
-        "drawn": (drawn := int((gaussians.opacities > 0).sum())),
+        "drawn": drawn,
         "excess_voxels": float(total.detach()) / max(int(beyond.sum()), 1) / config.voxel_size,
     } | _volume_ratios(gaussians, by_scales, drawn, config.losses)
 

@@ -9,7 +9,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.losses import InitialLossWeights, offset_distance, volume
-from structgstream_studies.experiments.distance_gradients import compared
+from structgstream_studies.experiments.loss_gradients import compared
 
 VOXEL = 0.1
 
