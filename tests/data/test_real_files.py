@@ -27,7 +27,7 @@ from structgstream.data.images import (
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.video import high_range_to_srgb, synchronised
-from structgstream.data.video_index import HLG, PQ, scan_videos
+from structgstream.data.video_index import BT2020, HLG, PQ, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
 from tests.support.captures import small_rig
@@ -161,7 +161,7 @@ def test_what_alpha_of_a_video_hides_does_not_count(tmp_path: Path, ending: str,
 @pytest.mark.parametrize(("transfer", "signal", "expected"), [(HLG, 0.5, 137), (PQ, 0.508, 186), (PQ, 1.0, 255)])
 def test_high_dynamic_range_is_converted_to_srgb(transfer: int, signal: float, expected: int) -> None:
     grey = np.full((1, 1, 3), round(signal * 65535), np.uint16)
-    np.testing.assert_allclose(high_range_to_srgb(grey, transfer, wide=True), expected, atol=1)
+    np.testing.assert_allclose(high_range_to_srgb(grey, transfer, BT2020), expected, atol=1)
 
 
 def picture_source(folder: Path, content: np.ndarray[Any, Any]) -> ImageSource:

@@ -95,12 +95,26 @@ def test_turned_videos_are_read_as_they_are_shown(tmp_path: Path, turn: int, qua
             )
             for transfer in ("undef", "bt2020-10")
         ),
+        ("has the primaries of DCI-P3", {"options": {"x264-params": "colorprim=smpte431"}}),
     ],
 )
 def test_what_is_refused(tmp_path: Path, said: str, written: dict[str, Any]) -> None:
     write(tmp_path / "a.mp4", [corners()] * 5, **written)
     with pytest.raises(CaptureError, match=re.escape(f"a.mp4 {said}")):
         scan_videos({"a": tmp_path / "a.mp4"})
+
+
+def test_display_p3_is_converted_to_srgb(tmp_path: Path) -> None:
+    """The red, green and blue of sRGB have these values in Display P3; grey has the same in both."""
+    coded = [(234, 51, 35), (117, 251, 76), (0, 0, 245), (128, 128, 128)]
+    expected = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)]
+    shown = np.repeat(np.repeat(np.array([coded], np.uint8), 48, axis=0), 16, axis=1)
+    for name in RIG:
+        write(tmp_path / f"{name}.mp4", [shown] * 2, options={"qp": "0", "x264-params": "colorprim=smpte432"})
+    source = synchronised(scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG}), RIG, where=tmp_path)
+    read = next(source.frames()).images["cam00"][24, 8::16]
+    np.testing.assert_allclose(read, expected, atol=16)  # Near 0 a step of the file is up to 13 steps of sRGB.
+    np.testing.assert_allclose(read[3], 128, atol=2)
 
 
 def test_the_shape_of_pixels_is_read(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ Note [High dynamic range]
 HLG and PQ (ITU-R BT.2100) are converted to light on a display: of HLG for a display of 1000 cd/m2, as BT.2100 has it.
 Reference white, 203 cd/m2 (ITU-R BT.2408), becomes 1; what is brighter than three quarters of it is compressed
 smoothly, by the brightest channel, so that hues remain. Every frame of a file is converted alike, so still things keep
-their colours.
+their colours. Other video is taken as sRGB, as players show it; with the primaries of Display P3, as telephones write
+them, its light is converted to sRGB's primaries, and what lies outside of these is clipped.
 """
 
 import logging
@@ -34,12 +35,16 @@ from structgstream.data.images import OPAQUE, reduced_mask
 from structgstream.data.timeline import Clock, measured_rate, paired, period_seconds
 from structgstream.data.video_index import (
     BT2020,
+    DISPLAY_P3,
     HIGH_RANGE,
     HLG,
+    SRGB,
     STREAM_FORMATS,
+    UNSPECIFIED,
     VideoTrack,
     load_av,
     open_video,
+    primaries_of,
     transfer_of,
     video_stream,
 )
@@ -366,22 +371,23 @@ def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, he
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
     A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
-    that states no range is taken as limited unless its pixel format states otherwise. HLG and PQ are
-    converted (:func:`high_range_to_srgb`).
+    that states no range is taken as limited unless its pixel format states otherwise. HLG, PQ and the primaries of
+    Display P3 are converted (Note [High dynamic range]).
     """
     matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)
     source_range = int(frame.color_range)
     if source_range not in (FULL_RANGE, LIMITED_RANGE):
         full = frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr"))
         source_range = FULL_RANGE if full else LIMITED_RANGE
-    transfer = transfer_of(frame)
+    transfer, primaries = transfer_of(frame), primaries_of(frame)
     high = transfer in HIGH_RANGE
+    converts = high or primaries == DISPLAY_P3
     shrinks = width < frame.width or height < frame.height
     converted = reformatter.reformat(
         frame,
         width=width,
         height=height,
-        format="rgb48le" if high else "rgb24",
+        format="rgb48le" if converts else "rgb24",
         src_colorspace=matrix,
         dst_colorspace=matrix,
         src_color_range=source_range,
@@ -389,10 +395,10 @@ def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, he
         interpolation=(AREA if shrinks else BICUBIC) | FULL_CHROMA | ACCURATE_ROUNDING,
         threads=1,
     )
-    if high:
-        wide = int(getattr(frame, "color_primaries", BT2020)) == BT2020
-        return high_range_to_srgb(cast(NDArray[np.uint16], converted.to_ndarray()), transfer, wide=wide)
-    return cast(NDArray[np.uint8], converted.to_ndarray())
+    if not converts:
+        return cast(NDArray[np.uint8], converted.to_ndarray())
+    values = cast(NDArray[np.uint16], converted.to_ndarray())
+    return high_range_to_srgb(values, transfer, primaries) if high else display_p3_to_srgb(values)
 
 
 WHITE, PEAK, KNEE = 203.0, 1000.0, 0.75
@@ -400,29 +406,41 @@ WHITE, PEAK, KNEE = 203.0, 1000.0, 0.75
 BT2020_TO_709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )  # ITU-R BT.2087
+DISPLAY_P3_TO_709 = np.array(
+    [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0982]], np.float32
+)  # From the chromaticities of SMPTE EG 432-1 and BT.709, both with D65.
 LUMA_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
 
 
-def high_range_to_srgb(picture: NDArray[np.uint16], transfer: int, *, wide: bool) -> NDArray[np.uint8]:
+def display_p3_to_srgb(picture: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """sRGB of a picture ``[H, W, 3]`` in Display P3, full range. What lies outside of sRGB's primaries is clipped."""
+    return _encoded(np.maximum(_decoding(SRGB)[picture] @ DISPLAY_P3_TO_709.T, 0))
+
+
+def high_range_to_srgb(picture: NDArray[np.uint16], transfer: int, primaries: int) -> NDArray[np.uint8]:
     """sRGB of a picture ``[H, W, 3]`` of high dynamic range (:data:`HLG` or PQ), full range (Note [High dynamic
-    range]); ``wide`` if its primaries are those of BT.2020, else those of BT.709."""
+    range]). Primaries that are not stated are those of BT.2020."""
     light = _decoding(transfer)[picture]
     if transfer == HLG:  # Scene light to a display's, by luminance: the system gamma of 1.2.
         light *= np.maximum(light @ LUMA_2020, 1e-9)[..., None] ** np.float32(0.2) * np.float32(PEAK / WHITE)
-    if wide:
+    if primaries in (BT2020, UNSPECIFIED):
         light = light @ BT2020_TO_709.T
+    elif primaries == DISPLAY_P3:
+        light = light @ DISPLAY_P3_TO_709.T
     np.maximum(light, 0, out=light)
     brightest = np.maximum(light.max(axis=2, keepdims=True), 1e-9)
     shoulder = KNEE + (1 - KNEE) * -np.expm1((KNEE - brightest) / (1 - KNEE))
     light *= np.where(brightest > KNEE, shoulder / brightest, 1)
-    return _encoding()[(np.minimum(light, 1) * 4095 + 0.5).astype(np.uint16)]
+    return _encoded(light)
 
 
 @cache
 def _decoding(transfer: int) -> NDArray[np.float32]:
-    """Light of each of 65536 values: of HLG the scene's, up to 1; of PQ the display's, reference white 1."""
+    """Light of each of 65536 values: of HLG the scene's, up to 1; of sRGB and PQ the display's, reference white 1."""
     signal = np.linspace(0, 1, 65536)
-    if transfer == HLG:
+    if transfer == SRGB:
+        light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+    elif transfer == HLG:
         a, b, c = 0.17883277, 0.28466892, 0.55991073
         light = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
     else:
@@ -430,6 +448,10 @@ def _decoding(transfer: int) -> NDArray[np.float32]:
         root = signal ** (1 / m2)
         light = (np.maximum(root - c1, 0) / (c2 - c3 * root)) ** (1 / m1) * 10000 / WHITE
     return light.astype(np.float32)
+
+
+def _encoded(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return _encoding()[(np.minimum(light, 1) * 4095 + 0.5).astype(np.uint16)]
 
 
 @cache

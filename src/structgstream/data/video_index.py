@@ -45,14 +45,15 @@ TURNS: Mapping[tuple[float, ...], int] = {
 
 
 # Numbers of ISO/IEC 23091-2.
-UNSPECIFIED, PQ, HLG, BT2020 = 2, 16, 18, 9
+UNSPECIFIED, SRGB, PQ, HLG = 2, 13, 16, 18
+BT2020, DCI_P3, DISPLAY_P3 = 9, 11, 12
 HIGH_RANGE = frozenset({PQ, HLG})
 DISPLAY_REFERRED = frozenset({0, 1, UNSPECIFIED, 4, 5, 6, 7, 11, 12, 13, 14, 15})
 TRANSFERS = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 6: "BT.601", 7: "SMPTE 240M", 8: "linear", 9: "logarithmic",
-             10: "logarithmic", 11: "xvYCC", 12: "BT.1361", 13: "sRGB", 14: "BT.2020", 15: "BT.2020", PQ: "PQ",
+             10: "logarithmic", 11: "xvYCC", 12: "BT.1361", SRGB: "sRGB", 14: "BT.2020", 15: "BT.2020", PQ: "PQ",
              17: "SMPTE 428", HLG: "HLG"}  # fmt: skip
 PRIMARIES = {1: "BT.709", 4: "BT.470M", 5: "BT.470BG", 6: "SMPTE 170M", 7: "SMPTE 240M", BT2020: "BT.2020",
-             11: "DCI-P3", 12: "Display P3"}  # fmt: skip
+             DCI_P3: "DCI-P3", DISPLAY_P3: "Display P3"}  # fmt: skip
 MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020",
             10: "BT.2020 constant luminance"}  # fmt: skip
 UNREAD_MATRICES = {8: "YCgCo", 11: "SMPTE 2085", 12: "chromaticity-derived", 13: "chromaticity-derived", 14: "ICtCp",
@@ -266,17 +267,27 @@ def transfer_of(frame: "VideoFrame") -> int:
     return int(getattr(frame, "color_trc", UNSPECIFIED))
 
 
+def primaries_of(frame: "VideoFrame") -> int:
+    """The primaries that a frame states, as the number of ISO/IEC 23091-2."""
+    return int(getattr(frame, "color_primaries", UNSPECIFIED))
+
+
 def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     """What a video states of its colours by one of its frames, in words; None where none decodes. Raises CaptureError
     for a transfer function or a matrix that is not converted, and for wide primaries without HLG or PQ."""
     if frame is None:
         return "no frame decodes"
-    transfer, primaries = transfer_of(frame), int(getattr(frame, "color_primaries", UNSPECIFIED))
+    transfer, primaries = transfer_of(frame), primaries_of(frame)
     if transfer not in HIGH_RANGE and primaries == BT2020:
         raise CaptureError(
             f"The video {path} has the primaries of BT.2020 and does not state HLG or PQ, as log videos have it, so "
             "its colours are not those of sRGB; convert it to BT.709 with the camera maker's conversion, keeping the "
             "time of each frame, or film in BT.709."
+        )
+    if primaries == DCI_P3:
+        raise CaptureError(
+            f"The video {path} has the primaries of DCI-P3, whose white is a cinema projector's; expected BT.709, "
+            "Display P3 or BT.2020: convert it to BT.709, keeping the time of each frame."
         )
     if transfer not in DISPLAY_REFERRED | HIGH_RANGE:
         what = TRANSFERS.get(transfer, f"number {transfer}")
@@ -294,5 +305,5 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     words = [frame.format.name, matrix, bounds]
     words += [f"primaries {PRIMARIES[primaries]}"] if primaries in PRIMARIES else []
     words += [TRANSFERS[transfer]] if transfer in TRANSFERS else []
-    words += ["converted to sRGB"] if transfer in HIGH_RANGE else []
+    words += ["converted to sRGB"] if transfer in HIGH_RANGE or primaries == DISPLAY_P3 else []
     return ", ".join(words)
