@@ -198,7 +198,10 @@ def _nothing_roving(
 
 
 BLURRED = 0.2  # share of the keypoints of a still camera below which roving frames are blurred
-REMEDY = "Let neighbouring cameras see more of the same, take more instants, or film a board (structgstream board)."
+REMEDY = (
+    "Let neighbouring cameras see more of the same, let people walk about in the take, or film a board "
+    "(structgstream board)."
+)
 
 
 def _agreeing(pairs: Mapping[Pair, Any], pair: Pair) -> int:
@@ -219,7 +222,7 @@ def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pai
         reasons.append(f"{name!r} ({agree} agree)")
     return (
         f"{listed(missing)} could not be placed: {'; '.join(reasons)}. Let neighbouring cameras see more of the same "
-        "from at most 30 degrees apart, take more instants, or film a board (structgstream board)."
+        "from at most 30 degrees apart, let people walk about in the take, or film a board (structgstream board)."
     )
 
 
@@ -443,8 +446,8 @@ def _held_out(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     judging = {pair: chosen[track[one]] for pair, (one, _) in zip(graph.matches, ends, strict=True)}
     if sum(int(fixed.sum()) for fixed in judging.values()) < MIN_HELD_OUT:
         raise CalibrationError(
-            f"Only {len(first)} matches agree with the given poses, too few to refine them: take more instants, or "
-            "let neighbouring cameras see more of the same."
+            f"Only {len(first)} matches agree with the given poses, too few to refine them: let people walk about "
+            "in the take, or let neighbouring cameras see more of the same."
         )
     return judging
 
