@@ -21,7 +21,7 @@ from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
-from structgstream.evaluation.recording import captures_of, part_metadata
+from structgstream.evaluation.recording import captures_of, check_has_first_frame, part_metadata
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import log_of
 from structgstream.exporters.formats import Format, FrameOptions, PageFormat, check_page, choose_frames, destination
@@ -243,10 +243,11 @@ def evaluate(
     Raises:
         StreamError: the file is not a stream, or is damaged.
         CaptureError: the capture is not that of the stream.
-        ConfigError: there is no camera to score.
+        ConfigError: there is no camera or frame to score.
         BackendError: the back-end is not available.
     """
     with open_stream(path) as reader:
+        check_has_first_frame(reader)
         stored = None
         if isinstance(capture, Path | str):
             capture, stored = captures_of(reader.header, capture, frames=len(reader.packets))

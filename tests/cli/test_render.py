@@ -132,6 +132,8 @@ def test_lost_frames_are_left_out(tmp_path: Path, run: Runner) -> None:
     assert "frames 1 to 1 and 3 to 4; there is no frame 0" in run([*base, "--frame", "0"], status=2).err
     compared = run([base[0], base[1], CLIP, "--compare"], status=2).err
     assert "before the first lost one, which is frame 0" in compared
+    scored = run(["evaluate", base[1], CLIP], status=2).err
+    assert "frame 0 of the stream is lost or no longer stored, and scores begin with it" in scored
 
 
 def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:

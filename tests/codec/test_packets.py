@@ -138,6 +138,21 @@ def test_texts_that_are_no_description(text: bytes) -> None:
         unpack_header(closed(text, b""))
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_description_that_is_not_plain_utf_8(encoding: str) -> None:
+    description, blocks = opened(pack_header(header_for(small_scene())))
+    with pytest.raises(StreamError, match="init record"):
+        unpack_header(closed(json.dumps(description).encode(encoding), blocks))
+
+
+def test_what_follows_the_description_in_its_block() -> None:
+    description, blocks = opened(pack_header(header_for(small_scene())))
+    packed = zstandard.ZstdCompressor().compress(json.dumps(description).encode())
+    for more in (b"\0", zstandard.ZstdCompressor().compress(b"{}")):
+        with pytest.raises(StreamError, match="init record"):
+            unpack_header(struct.pack("<I", len(packed + more)) + packed + more + blocks)
+
+
 def test_a_description_that_no_reader_would_unpack_is_not_written() -> None:
     long = replace(header_for(small_scene(1)), metadata={"note": "a" * MAX_JSON_BYTES})
     with pytest.raises(StreamError, match=f"at most {MAX_JSON_BYTES} are allowed; leave out metadata or cameras"):

@@ -11,7 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from structgstream.cli.app import UsageError
+from structgstream.cli.app import usage_errors
 from structgstream.cli.options import (
     Cameras,
     Device,
@@ -75,13 +75,13 @@ def main(arguments: list[str]) -> None:
     check_ending(options.json, ".json", command="evaluate", option="--json")
     check_ending(options.report, command="evaluate", option="--report", folder=True)
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.recording import captures_of
+    from structgstream.evaluation.recording import captures_of, check_has_first_frame
     from structgstream.evaluation.report import as_json
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
-    if not reader.packets:
-        raise UsageError("the stream has no whole frame, so there is nothing to score.")
+    with usage_errors():
+        check_has_first_frame(reader)
     source, stored = captures_of(reader.header, options.scene, frames=len(reader.packets))
     report = run_evaluation(
         reader,

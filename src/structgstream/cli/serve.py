@@ -33,7 +33,8 @@ class Serve:
 
     Listens on the loopback address by default, until Ctrl-C or SIGTERM. Streams are folders of segments and files that
     end in .sgs; FOLDER itself may hold the segments of one. For the public, put a reverse proxy in front of it: it adds
-    TLS, a cache, and limits on rates, connections and slow clients, which this server does not have (docs/serve.md).
+    TLS, a cache, and limits on rates, on slow clients and on the connections of each, which this server does not have
+    (docs/serve.md).
 
     Example: structgstream serve streams
 

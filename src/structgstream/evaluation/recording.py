@@ -13,6 +13,7 @@ import torch
 from structgstream.cameras import Camera, CameraRig, rig_radius
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.reader import StreamReader
 from structgstream.data.images import ImageSource
 from structgstream.data.open import open_capture
 from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized_to, section
@@ -161,6 +162,13 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
                 f"Camera {name!r} of the capture {source.name} has another calibration than in the stream; "
                 "evaluate the stream on the capture it was made from."
             )
+
+
+def check_has_first_frame(reader: StreamReader) -> None:
+    """Check that frame 0 can be decoded, with which scores begin. Raises ConfigError."""
+    if not reader.packets:
+        lost = "frame 0 of the stream is lost or no longer stored, and scores begin with it"
+        raise ConfigError(f"{lost if reader.runs else 'the stream has no whole frame'}, so there is nothing to score.")
 
 
 def check_same_frames(recording: Recording, source: FrameSource) -> None:

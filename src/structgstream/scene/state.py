@@ -67,8 +67,10 @@ class Parameter:
         name: its name in configurations and in the header's steps.
         path: path of the attribute in a :class:`Scene`.
         columns: number of its columns in the field; one column is a vector in the scene. 0: the whole field.
-        step: the field of ``RoundingConfig`` with its quantization step after frame 0; None: never quantized.
-        online_rate: the field of ``OnlineRates`` with its learning rate after frame 0; None: not trained.
+        step: the constant of ``RoundingConfig``, in lower case, with its quantization step after frame 0; None: never
+            quantized.
+        online_rate: the constant of ``OnlineRates``, in lower case, with its learning rate after frame 0; None: not
+            trained.
         first_rate: the field of ``InitialRates`` with its learning rate in frame 0; None: not trained.
     """
 
@@ -113,8 +115,8 @@ class StateField:
         outputs: an MLP's outputs per structured Gaussian; 0 for other fields.
         init_coding: coding in the init record of a compact stream.
         step, online_rate, first_rate: as in :class:`Parameter`.
-        init_step: the field of ``RoundingConfig`` with its quantization step in frame 0; ``sensitivity``: chosen from
-            the sensitivity of the renderings; ``own``: chosen by the code that creates the field. None: as ``step``.
+        init_step: the constant of ``RoundingConfig``, in lower case, with its step in frame 0; ``sensitivity``: chosen
+            from the sensitivity of the renderings; ``own``: chosen by the code that makes the field. None: as ``step``.
     """
 
     name: FieldName

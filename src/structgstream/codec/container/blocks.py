@@ -155,9 +155,8 @@ def read_description(payload: bytes) -> dict[str, Any]:
         size = frame_content_size(packed)
         if not 0 <= size <= MAX_JSON_BYTES:
             raise ValueError(f"its description unpacks to {size} bytes, at most {MAX_JSON_BYTES} are allowed")
-        return json.loads(
-            ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES), parse_constant=_refuse_constant
-        )
+        text = ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES, allow_extra_data=False)
+        return json.loads(text.decode(), parse_constant=_refuse_constant)  # Of bytes it would guess the encoding.
     except ZstdError as error:
         raise ValueError(str(error)) from error
 

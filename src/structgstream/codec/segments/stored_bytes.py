@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-
 from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.records import PREFIX, RECORD_TYPES, PacketKind, Period, RecordType, pack_index
 from structgstream.codec.segments.manifest import (
@@ -225,7 +223,7 @@ class StoredBytes:
         else:
             first, sizes = entry.first_frame, entry.frame_bytes
             kinds = [PacketKind.KEY, *[PacketKind.DELTA] * (entry.frames - 1)]
-            seconds = np.linspace(*entry.pts_seconds, entry.frames).tolist()
+            seconds = _evenly(*entry.pts_seconds, entry.frames)
         if not self.periods or self.periods[-1].number != entry.period:
             self.periods.append(Period(entry.period, first, 0, 0))
         self.sizes += sizes
@@ -311,3 +309,9 @@ def write_archive(store: Store, path: Path) -> int:
         )
     atomic_write(path, stored.files())
     return len(stored.sizes)
+
+
+def _evenly(first: float, last: float, number: int) -> list[float]:
+    """``number`` times from ``first`` to ``last``: those of numpy's ``linspace``, which the server runs without."""
+    step = (last - first) / max(number - 1, 1)
+    return [first + index * step for index in range(number - 1)] + [last if number > 1 else first]
