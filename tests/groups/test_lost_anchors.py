@@ -45,7 +45,7 @@ def recalled(scene: Scene) -> tuple[torch.Tensor, int]:
         WORLD.scene.anchors,
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
-        floor=None,
+        baseline=None,
         rules=SpawnRules(longer_side=96),
         backend=BACKEND,
     )

@@ -138,7 +138,7 @@ def frame_task(index: int) -> Any:
     pictures = SimpleNamespace(views=["a", "b"], changes=None)
     frame = SimpleNamespace(index=index)
     return SimpleNamespace(
-        frame=frame, pictures=pictures, backend=backend, seed=3, steps={}, on_step=None, pressure=0.0
+        frame=frame, pictures=pictures, backend=backend, seed=3, steps={}, on_step=None, rate_scale=0.0
     )
 
 
@@ -156,10 +156,10 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
     for index in (FIRST + 1, FIRST + 2):
         made.next(Past(SCENE, FrameZeroContext()), frame_task(index))
     (_, second), (_, third) = usual.asked
-    assert third.older is None
-    moved = SCENE.anchors.positions - second.older.anchors.positions
+    assert third.before_previous is None
+    moved = SCENE.anchors.positions - second.before_previous.anchors.positions
     torch.testing.assert_close(moved, 0.5 * torch.arange(15, dtype=torch.float32).reshape(5, 3))
-    assert len(second.older.free) == 0
+    assert len(second.before_previous.free) == 0
     assert second.state is SCENE
 
 

@@ -15,7 +15,7 @@ from structgstream.training.online.config import SceneFlowConfig
 from structgstream.training.online.exposure import exposure_reference
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
-from structgstream.training.residuals import residual_floor
+from structgstream.training.residuals import baseline_residual
 from structgstream.training.result import FitResult
 from structgstream.training.views import training_views
 from tests.support.backends import needs_native
@@ -45,11 +45,11 @@ def second_frame(
         scene = moved(world.scene, DEVICE)
         with counts.paused():
             first = training_views(world.frames[0], world.rig, DEVICE)
-            floor = residual_floor(scene, first, scale=config.motion.picture_scale, backend=backend)
+            baseline = baseline_residual(scene, first, scale=config.motion.picture_scale, backend=backend)
             light = exposure_reference(scene, first, config=config.exposure)
         shown = [first]
 
-        def fit_frame(index: int, last: Scene, older: Scene) -> FitResult[Scene]:
+        def fit_frame(index: int, last: Scene, before_previous: Scene) -> FitResult[Scene]:
             pictures = preprocess(
                 world.frames[index],
                 world.rig,
@@ -67,8 +67,8 @@ def second_frame(
                 backend=backend,
                 seed=0,
                 pictures=pictures,
-                older=older,
-                floor=floor,
+                before_previous=before_previous,
+                baseline=baseline,
                 light=light,
             )
 

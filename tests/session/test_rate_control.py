@@ -57,10 +57,10 @@ def growing(group: int) -> float:
 def simulated(
     target_mbits: float, *, exponent: float, keys: Callable[[int], float] = constant, frames: int = 240
 ) -> tuple[list[int], RateController]:
-    """Packets of a scene that moves 1.6 times as much from frame 70 on; bytes fall with ``pressure ** -exponent``."""
+    """Packets of a scene that moves 1.6 times as much from frame 70 on; bytes fall with ``rate_scale ** -exponent``."""
     run, noise = Run(target_mbits), random.Random(0)
     for index in range(frames):
-        delta = 14e3 * (1.6 if index > 70 else 1.0) * run.controller.pressure**-exponent * noise.uniform(0.85, 1.15)
+        delta = 14e3 * (1.6 if index > 70 else 1.0) * run.controller.rate_scale**-exponent * noise.uniform(0.85, 1.15)
         key = keys(index // KEY_EVERY) if index else 300
         run.add(int(key if run.kind is PacketKind.KEY else delta))
     return [size for size, _, _ in run.written], run.controller
@@ -90,7 +90,7 @@ def test_the_rate_is_met_at_few_frames_a_second(fps: float) -> None:
         kind = keys.kind(index, index / fps)
         if kind is PacketKind.KEY:
             keys.begin(index, index / fps)
-        size = 200e3 / fps * (0.2 if kind is PacketKind.KEY else controller.pressure ** (-1 / 3))
+        size = 200e3 / fps * (0.2 if kind is PacketKind.KEY else controller.rate_scale ** (-1 / 3))
         controller.add(int(size), kind, index=index, pts_seconds=index / fps)
         sizes.append(int(size))
     assert sum(sizes[-20:]) * 8e-6 * fps / 20 == pytest.approx(1.0, rel=0.02)
@@ -105,34 +105,34 @@ def test_a_key_packet_is_saved_for_before_it_comes() -> None:
     assert last == pytest.approx(first, rel=0.1)
 
 
-def test_the_pressure_follows_from_the_packets_alone() -> None:
+def test_the_rate_scale_follows_from_the_packets_alone() -> None:
     """What a resumed session does: it tells a new controller of all packets."""
     sizes, controller = simulated(3.6, exponent=0.33, frames=137)
     again = Run(3.6)
     for size in sizes:
         again.add(size)
-    assert again.controller.pressure == controller.pressure != 1.0
+    assert again.controller.rate_scale == controller.rate_scale != 1.0
 
 
 def test_without_a_target_nothing_is_pressed() -> None:
     run = Run(None)
     run.add(10**9)
-    assert run.controller.pressure == 1.0
+    assert run.controller.rate_scale == 1.0
     config = OnlineConfig()
     assert with_rate_control(config, 1.0) is config
 
 
-def test_pressure_has_bounds_and_changes_step_by_step() -> None:
+def test_the_rate_scale_has_bounds_and_changes_step_by_step() -> None:
     for size, expected, step in ((10**7, MOST, 4.0), (1, LEAST, 0.5)):
         run = Run(1.0)
-        controller, before = run.controller, run.controller.pressure
+        controller, before = run.controller, run.controller.rate_scale
         run.add(100)
-        assert controller.pressure == before, "the first packet says nothing"
+        assert controller.rate_scale == before, "the first packet says nothing"
         for _ in range(28):
             run.add(size)
-            assert controller.pressure in (before * step, expected)
-            before = controller.pressure
-        assert controller.pressure == expected
+            assert controller.rate_scale in (before * step, expected)
+            before = controller.rate_scale
+        assert controller.rate_scale == expected
 
 
 def test_a_target_that_is_missed_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -177,7 +177,7 @@ def test_the_rate_is_one_of_media_time_where_frames_are_left_out(seconds: float,
     """Frames are seldom, so each may be large, and key packets come by media time, not by number."""
     run, noise = Run(1.0, left_out(seconds)), random.Random(0)
     for index in range(400):
-        changes = 2.5e5 * seconds * run.controller.pressure**-exponent * noise.uniform(0.85, 1.15)
+        changes = 2.5e5 * seconds * run.controller.rate_scale**-exponent * noise.uniform(0.85, 1.15)
         all_changes = changes * min(index, 9) ** 0.5 if run.kind is PacketKind.KEY else changes
         run.add(int(all_changes) if index else 300)
     keys = [i for i, (_, _, kind) in enumerate(run.written) if kind is PacketKind.KEY]
@@ -192,7 +192,7 @@ def test_a_key_packet_is_saved_for_where_frames_are_left_out() -> None:
     """As it is where none is, although it comes by media time: here every tenth frame."""
     run = Run(1.0, lambda index: 0.1)
     for index in range(200):
-        size = 4e3 * index**0.5 if run.kind is PacketKind.KEY else 14e3 / run.controller.pressure
+        size = 4e3 * index**0.5 if run.kind is PacketKind.KEY else 14e3 / run.controller.rate_scale
         run.add(int(size) if index else 300)
     assert [i for i, (_, _, kind) in enumerate(run.written) if kind is PacketKind.KEY] == [*range(0, 200, 10)]
     groups = [[size for size, _, _ in run.written[i + 1 : i + 10]] for i in range(40, 200, 10)]

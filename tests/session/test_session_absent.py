@@ -179,7 +179,7 @@ def masked(world: World, masks: Mapping[str, np.ndarray], garbage: int | None) -
 
 
 def test_what_masks_leave_out_has_no_influence_on_a_single_byte(world: World, tmp_path: Path) -> None:
-    """Loss, gate, flow, births, floor and colours: all of them with noise that flickers in every masked pixel."""
+    """Loss, dynamic masks, flow, spawning, baseline and colours, with noise that flickers in every masked pixel."""
     rng = np.random.default_rng(5)
     masks = {name: np.ones((64, 96), bool) for name in ("cam01", "cam02", "cam03")}
     masks["cam01"][:, 60:] = False

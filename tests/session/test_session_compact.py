@@ -120,7 +120,7 @@ def test_an_environment_is_in_the_header_and_in_every_scene() -> None:
 
 
 def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
-    """The target is half of what frame 2 takes without one; the pressure after it is a matter of record."""
+    """The target is half of what frame 2 takes without one; the rate scale after it is a matter of record."""
     free = whole()[1]
     config = replace(
         CONFIG,

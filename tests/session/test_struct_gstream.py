@@ -42,13 +42,13 @@ def test_a_first_frame_leaves_what_later_ones_use() -> None:
         return method.prepare(WORLD.scene, lambda: task(method))
 
     both = prepared(residuals=True, light=True)
-    assert both.floor is not None
-    assert both.floor.maps.keys() == {0, 1, 2, 3}
+    assert both.baseline is not None
+    assert both.baseline.maps.keys() == {0, 1, 2, 3}
     assert both.light is not None
-    floor_only, light_only = prepared(residuals=True, light=False), prepared(residuals=False, light=True)
-    assert floor_only.floor is not None
-    assert floor_only.light is None
-    assert light_only.floor is None
+    baseline_only, light_only = prepared(residuals=True, light=False), prepared(residuals=False, light=True)
+    assert baseline_only.baseline is not None
+    assert baseline_only.light is None
+    assert light_only.baseline is None
     assert light_only.light is not None
 
 
@@ -61,7 +61,7 @@ def test_pictures_of_a_first_frame_are_not_read_where_nothing_is_kept() -> None:
 def test_earlier_pictures_and_frames_are_asked_for_where_they_are_used() -> None:
     def asks(config: StreamConfig) -> tuple[bool, bool]:
         method = StructGStream(config)
-        return method.needs_before, method.needs_older
+        return method.needs_before, method.needs_before_previous
 
     def of(*, motion: bool, prior: float, ease: float) -> StreamConfig:
         online = COMPACT.online

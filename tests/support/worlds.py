@@ -18,7 +18,7 @@ from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import measure
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.online.select import DynamicSelection, select_dynamic
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.views import View, training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
@@ -107,11 +107,11 @@ def moved_since(
     config: MotionConfig,
     backend: Backend | None = None,
     flow_from: Collection[int] = (),
-    older: Scene | None = None,
-    floor: ResidualFloor | None = None,
+    before_previous: Scene | None = None,
+    baseline: BaselineResidual | None = None,
 ) -> DynamicSelection:
     """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
     backend = backend or quickest_backend()
     changes = detect_changes(views, before, config=config, backend=backend, flow_from=flow_from)
-    measured = measure(scene, views, changes, config=config, backend=backend, floor=floor)
-    return select_dynamic(scene, measured, config=config, backend=backend, older=older)
+    measured = measure(scene, views, changes, config=config, backend=backend, baseline=baseline)
+    return select_dynamic(scene, measured, config=config, backend=backend, before_previous=before_previous)

@@ -20,7 +20,7 @@ from structgstream.training.frame0.quantization import (
     _quantize_rows,
     estimate_sensitivity,
     quantize_first_frame,
-    regauge,
+    whiten_features,
 )
 from structgstream.training.parameters import RoundingConfig
 from tests.support.backends import quickest_backend
@@ -41,7 +41,7 @@ def before() -> tuple[Scene, Sensitivity]:
 
 @cache
 def after() -> tuple[Scene, Sensitivity]:
-    return regauge(*before())
+    return whiten_features(*before())
 
 
 def pictures(scene: Scene, rig: CameraRig = RIG) -> torch.Tensor:
@@ -184,7 +184,7 @@ def test_a_scene_that_no_camera_sees() -> None:
     away = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + 1e4))
     sensitivity = estimate_sensitivity(away, RIG, backend=BACKEND, seed=0)
     assert not sensitivity.used.any()
-    other, sensitivity = regauge(away, sensitivity)
+    other, sensitivity = whiten_features(away, sensitivity)
     found, _ = quantize_first_frame(other, sensitivity, config=RoundingConfig(), voxel_size=VOXEL, steps=STEPS)
     assert all(value.isfinite().all() for value in state_of(found).values())
 

@@ -22,7 +22,7 @@ from structgstream.training.online.config import (
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.parameters import RoundingConfig
-from structgstream.training.residuals import residual_floor
+from structgstream.training.residuals import baseline_residual
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import World, moving_world
@@ -61,7 +61,7 @@ def fit(world: World, displacements: torch.Tensor, *, start: GroupStartConfig = 
         backend=backend,
         seed=1,
         steps=STEPS,
-        floor=residual_floor(world.scene, first, scale=config.motion.picture_scale, backend=backend),
+        baseline=baseline_residual(world.scene, first, scale=config.motion.picture_scale, backend=backend),
     )
 
 

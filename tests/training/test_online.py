@@ -147,15 +147,15 @@ def test_what_moves_begins_where_its_last_step_leads() -> None:
     """No iteration: the fit is where it began. What stands still stays, whatever it did before."""
     world = moving_world(2, speed=0.06, movers=20)
     motion = torch.full_like(world.scene.anchors.positions, 0.01)
-    older = with_displacements(world.scene, -motion)
+    before_previous = with_displacements(world.scene, -motion)
     config = replace(FOLLOWING, iterations=0, motion_prior=0.5)
     for moved in (replace(config, motion=MotionConfig()), config):
-        result = followed(world.scene, world, 1, config=moved, older=older)
+        result = followed(world.scene, world, 1, config=moved, before_previous=before_previous)
         steps = result.scene.anchors.positions - world.scene.anchors.positions
         went = (steps != 0).any(1)
         assert went.sum() == result.moving > 10
         torch.testing.assert_close(steps[went], 0.5 * motion[went])
-        later = followed(world.scene, world, 1, config=moved, older=older, intervals=2.0)
+        later = followed(world.scene, world, 1, config=moved, before_previous=before_previous, intervals=2.0)
         torch.testing.assert_close((later.scene.anchors.positions - world.scene.anchors.positions)[went], motion[went])
     alone = followed(world.scene, world, 1, config=config).scene
     assert torch.equal(alone.anchors.positions[went], world.scene.anchors.positions[went])

@@ -21,7 +21,7 @@ from structgstream.training.online.select import DynamicSelection, select_dynami
 from structgstream.training.online.smoothness import MotionSmoothness
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.parameters import pixel_size
-from structgstream.training.residuals import residual_floor
+from structgstream.training.residuals import baseline_residual
 from structgstream.training.views import View, training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import random_scene
@@ -112,10 +112,10 @@ def test_the_tiles_that_are_drawn_reach_as_far() -> None:
 
 def test_floors_and_light_are_compared_at_one_size() -> None:
     backend = quickest_backend()
-    floors = [residual_floor(WORLD.scene, views(0, n), scale=0.5, backend=backend).maps for n in SIZES]
+    baselines = [baseline_residual(WORLD.scene, views(0, n), scale=0.5, backend=backend).maps for n in SIZES]
     lights = [exposure_reference(WORLD.scene, views(0, n), config=ExposureConfig()).views for n in SIZES]
-    for index in floors[0]:
-        torch.testing.assert_close(floors[0][index], floors[1][index], atol=1e-3, rtol=0.0)
+    for index in baselines[0]:
+        torch.testing.assert_close(baselines[0][index], baselines[1][index], atol=1e-3, rtol=0.0)
         assert torch.equal(lights[0][index].image, lights[1][index].image)
 
 

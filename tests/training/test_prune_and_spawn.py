@@ -14,7 +14,7 @@ from structgstream.training.online.config import MotionConfig, SpawnConfig, Spaw
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.spawn import SpawnResult, Sweep, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
-from structgstream.training.residuals import ResidualFloor, residual_floor
+from structgstream.training.residuals import BaselineResidual, baseline_residual
 from tests.support.backends import on_each_backend, quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import emerging_ball, moved_since, moving_world
@@ -29,19 +29,19 @@ def renewed(
     scene: Scene = WORLD.scene,
     config: SpawnConfig = CONFIG,
     room: int = 1000,
-    floor: ResidualFloor | None = None,
+    baseline: BaselineResidual | None = None,
     residual_threshold: float = 0.0,
 ) -> SpawnResult:
     motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=residual_threshold)
     first, views = (WORLD.views(t) for t in (0, 1))
-    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor
-    split = DynamicSplit.of(scene, moved_since(scene, views, first, config=motion, backend=backend, floor=floor))
+    baseline = baseline_residual(WORLD.scene, first, scale=1.0, backend=backend) if baseline is None else baseline
+    split = DynamicSplit.of(scene, moved_since(scene, views, first, config=motion, backend=backend, baseline=baseline))
     return prune_and_spawn(
         split,
         views,
         find_active_tiles(split, views, config=motion, backend=backend),
         first_identity=1 << 32,
-        floor=floor,
+        baseline=baseline,
         room=room,
         config=config,
         backend=backend,
@@ -63,12 +63,12 @@ def test_an_emerging_ball_is_spawned_where_it_is(build: Callable[[], Backend]) -
 
 def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_floor_is_eased() -> None:
     scene, backend = WORLD.scene, quickest_backend()
-    floor = residual_floor(scene, WORLD.views(), scale=1.0, backend=backend)
-    bad = replace(floor, maps={i: torch.full_like(of_view, 0.02) for i, of_view in floor.maps.items()})
+    baseline = baseline_residual(scene, WORLD.views(), scale=1.0, backend=backend)
+    bad = replace(baseline, maps={i: torch.full_like(of_view, 0.02) for i, of_view in baseline.maps.items()})
     for of_view in bad.maps.values():
         of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
     spawned = [
-        len(renewed(backend, floor=bad, config=varied(CONFIG, CHANGED_FLOOR_MEDIANS=medians)).new_free)
+        len(renewed(backend, baseline=bad, config=varied(CONFIG, BASELINE_CAP_MEDIANS=medians)).new_free)
         for medians in (1e9, 1.0)
     ]
     assert spawned[0] == 0

@@ -9,11 +9,11 @@ from torch.nn.functional import avg_pool2d
 
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.residuals import (
-    ResidualFloor,
+    BaselineResidual,
     apply_camera_color,
+    baseline_residual,
     box_mean,
     recorded,
-    residual_floor,
     residuals,
 )
 from structgstream.training.views import blackened
@@ -58,33 +58,33 @@ def test_the_floor_is_what_frame_0_missed_nearby() -> None:
     image = spoiled[1].image.clone()
     image[10, 20] = 255 - image[10, 20]
     spoiled[1] = replace(spoiled[1], image=image)
-    clean, floor = (residual_floor(WORLD.scene, v, scale=1.0, backend=BACKEND).maps for v in (views(0), spoiled))
-    assert torch.equal(clean[0], floor[0])
-    more = floor[1] - clean[1]
+    clean, baseline = (baseline_residual(WORLD.scene, v, scale=1.0, backend=BACKEND).maps for v in (views(0), spoiled))
+    assert torch.equal(clean[0], baseline[0])
+    more = baseline[1] - clean[1]
     assert (more[8:13, 18:23] > 0.01).all()
     assert not more[:6].any()
 
 
 def test_the_floor_is_at_most_the_usual_one_where_pictures_have_changed() -> None:
-    floor = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 1.0]])  # The last pixel is masked.
+    baseline = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 1.0]])  # The last pixel is masked.
     changed = torch.tensor([[True, True, True, True, False, False]])
-    eased = ResidualFloor(1.0, {3: floor, 4: floor}).eased({3: changed}, medians=1.0).maps
-    torch.testing.assert_close(eased[3], torch.tensor([[0.1, 0.2, 0.3, 0.3, 0.5, 1.0]]))
-    assert torch.equal(eased[4], floor), "nothing is known of its changes"
-    none = ResidualFloor(1.0, {3: floor}).eased({3: changed}, medians=0.0).maps[3]
+    capped = BaselineResidual(1.0, {3: baseline, 4: baseline}).capped({3: changed}, medians=1.0).maps
+    torch.testing.assert_close(capped[3], torch.tensor([[0.1, 0.2, 0.3, 0.3, 0.5, 1.0]]))
+    assert torch.equal(capped[4], baseline), "nothing is known of its changes"
+    none = BaselineResidual(1.0, {3: baseline}).capped({3: changed}, medians=0.0).maps[3]
     assert not none[changed].any()
     masked = torch.ones(1, 6)
-    assert torch.equal(ResidualFloor(1.0, {3: masked}).eased({3: changed}, medians=1.0).maps[3], masked)
+    assert torch.equal(BaselineResidual(1.0, {3: masked}).capped({3: changed}, medians=1.0).maps[3], masked)
 
 
 def test_slow_change_is_seen_by_the_residual_alone() -> None:
     """Between two equal pictures nothing changed, but the scene was left behind a frame ago."""
-    floor = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND)
+    baseline = baseline_residual(WORLD.scene, views(0), scale=1.0, backend=BACKEND)
     config = varied(MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05), REACH_PIXELS=1)
 
     def found(threshold: float):
         wanted = replace(config, residual_threshold=threshold)
-        return moved_since(WORLD.scene, views(1), views(1), config=wanted, backend=BACKEND, floor=floor)
+        return moved_since(WORLD.scene, views(1), views(1), config=wanted, backend=BACKEND, baseline=baseline)
 
     assert not found(0.0).anchors.any()
     lagging = found(0.05).anchors
@@ -96,11 +96,11 @@ def test_what_frame_0_already_missed_does_not_count() -> None:
     other = moving_world(1, movers=0)
     wrong = replace(WORLD.scene, anchors=replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions + 0.05))
     seen = other.views()
-    floor = residual_floor(wrong, seen, scale=1.0, backend=BACKEND)
+    baseline = baseline_residual(wrong, seen, scale=1.0, backend=BACKEND)
     config = varied(MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05), REACH_PIXELS=1)
-    assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
-    free_of_it = replace(floor, maps={index: torch.zeros_like(values) for index, values in floor.maps.items()})
-    assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()
+    assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, baseline=baseline).anchors.any()
+    free_of_it = replace(baseline, maps={index: torch.zeros_like(values) for index, values in baseline.maps.items()})
+    assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, baseline=free_of_it).anchors.any()
 
 
 def test_masked_pixels_miss_nothing_and_their_floor_is_out_of_reach() -> None:
@@ -113,7 +113,7 @@ def test_masked_pixels_miss_nothing_and_their_floor_is_out_of_reach() -> None:
     assert not found[~mask].any()
     elsewhere = torch.where(mask[..., None], picture, 0.5)
     assert torch.equal(found, residuals([elsewhere], spoiled[:1], color, BACKEND)[0])
-    floor = residual_floor(WORLD.scene, spoiled, scale=1.0, backend=BACKEND).maps
-    assert (floor[0][~mask] == 1.0).all()
-    clean = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND).maps
-    torch.testing.assert_close(floor[0][24:], clean[0][24:])
+    baseline = baseline_residual(WORLD.scene, spoiled, scale=1.0, backend=BACKEND).maps
+    assert (baseline[0][~mask] == 1.0).all()
+    clean = baseline_residual(WORLD.scene, views(0), scale=1.0, backend=BACKEND).maps
+    torch.testing.assert_close(baseline[0][24:], clean[0][24:])

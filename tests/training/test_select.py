@@ -13,7 +13,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.select import changed_primitives
 from structgstream.training.online.split import DynamicSplit
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import random_scene
@@ -78,8 +78,8 @@ def test_what_moved_before_moves_more_easily() -> None:
     strict = varied(replace(CONFIG, hysteresis=0.2), MIN_CHANGED_SHARE=0.9)
     views, earlier = (WORLD.views(t) for t in (1, 0))
 
-    def found(older: Scene | None) -> torch.Tensor:
-        return moved_since(WORLD.scene, views, earlier, config=strict, older=older).anchors
+    def found(before_previous: Scene | None) -> torch.Tensor:
+        return moved_since(WORLD.scene, views, earlier, config=strict, before_previous=before_previous).anchors
 
     shift = torch.zeros_like(WORLD.scene.anchors.positions)
     shift[:20] = 0.01
@@ -91,19 +91,19 @@ def test_what_moved_before_moves_more_easily() -> None:
 
 
 def test_what_changed_is_reported_by_row_and_by_birth() -> None:
-    older = random_scene(6, free=4)
+    earlier = random_scene(6, free=4)
     births = torch.tensor([1, 4, 6, 9])
-    older = replace(older, free=replace(older.free, births=births))
-    assert not changed_primitives(older, older).any()
-    scales = older.anchors.log_base_scales.clone()
+    earlier = replace(earlier, free=replace(earlier.free, births=births))
+    assert not changed_primitives(earlier, earlier).any()
+    scales = earlier.anchors.log_base_scales.clone()
     scales[3, 2] += 0.1
     # One died, one is new, one has another colour.
-    free = older.free.select(torch.tensor([0, 2, 3]))
+    free = earlier.free.select(torch.tensor([0, 2, 3]))
     colors = free.colors.clone()
     colors[2] += 0.1
     free = replace(free, colors=colors).append(replace(free.select(torch.tensor([0])), births=torch.tensor([12])))
-    scene = replace(older, anchors=replace(older.anchors, log_base_scales=scales), free=free)
-    assert changed_primitives(older, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]
+    scene = replace(earlier, anchors=replace(earlier.anchors, log_base_scales=scales), free=free)
+    assert changed_primitives(earlier, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]
 
 
 def test_free_gaussians_that_no_view_shows_stay() -> None:
@@ -122,10 +122,10 @@ def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
     views, before = (WORLD.views(t) for t in (1, 0))
     back = views[1]
     others, known = ([view for view in of if view.index != back.index] for of in (views, before))
-    floor = ResidualFloor(1.0, {view.index: torch.zeros(32, 48) for view in views})
+    baseline = BaselineResidual(1.0, {view.index: torch.zeros(32, 48) for view in views})
     config = replace(CONFIG, residual_threshold=0.1)
-    for given in (None, floor):
-        found, alone = (moved_since(WORLD.scene, of, known, config=config, floor=given) for of in (views, others))
+    for given in (None, baseline):
+        found, alone = (moved_since(WORLD.scene, of, known, config=config, baseline=given) for of in (views, others))
         assert torch.equal(found.anchors, alone.anchors)
         assert found.anchors.any()
         assert found.inliers == (0, 1, 2, 3)
@@ -140,7 +140,7 @@ def test_a_camera_without_a_floor_votes_by_its_pictures_alone() -> None:
     ]
     known = {view.index: torch.ones(32, 48) for view in views if view.index != 2}
     config = replace(CONFIG, residual_threshold=0.05)
-    found = moved_since(WORLD.scene, *dark, config=config, floor=ResidualFloor(1.0, known))
+    found = moved_since(WORLD.scene, *dark, config=config, baseline=BaselineResidual(1.0, known))
     plain = moved_since(WORLD.scene, *dark, config=CONFIG)
     assert torch.equal(found.anchors, plain.anchors)
 

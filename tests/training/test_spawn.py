@@ -13,7 +13,7 @@ from structgstream.scene.render import draw
 from structgstream.training.online.config import SpawnRules
 from structgstream.training.online.spawn import Spawned, _merge_points, outlier_mask, spawn_by_sweep
 from structgstream.training.online.view_residuals import ViewResidual, view_residuals
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.views import View
 from tests.support.worlds import moving_world
 
@@ -38,9 +38,11 @@ def spoiled(view: View) -> torch.Tensor:
     return picture
 
 
-def compared(picture: torch.Tensor, view: View, *, rules: SpawnRules, floor: ResidualFloor | None) -> ViewResidual:
+def compared(
+    picture: torch.Tensor, view: View, *, rules: SpawnRules, baseline: BaselineResidual | None
+) -> ViewResidual:
     color = CameraColor.identity(view.index + 1)
-    (found,) = view_residuals([picture], [view], color, floor=floor, rules=rules, backend=reference_backend())
+    (found,) = view_residuals([picture], [view], color, baseline=baseline, rules=rules, backend=reference_backend())
     return found
 
 
@@ -50,21 +52,21 @@ def nothing_missing(view: View) -> ViewResidual:
 
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
     view = VIEWS[1]
-    none = compared(view.colors, view, floor=None, rules=RULES)
+    none = compared(view.colors, view, baseline=None, rules=RULES)
     assert not none.wrong.any()
     assert not none.missing_share.any()
-    found = compared(spoiled(view), view, floor=None, rules=RULES)
+    found = compared(spoiled(view), view, baseline=None, rules=RULES)
     inner = (view.colors[20:32, 30:42] - 0.5).abs().mean(-1) > 0.2  # grey has no opposite
     assert found.wrong[20:32, 30:42][inner].all()
     assert not found.missing_share[:15].any()
-    floor = ResidualFloor(1.0, {view.index: torch.full((64, 96), 1.0)})
-    assert not compared(spoiled(view), view, floor=floor, rules=RULES).missing_share.any()
+    baseline = BaselineResidual(1.0, {view.index: torch.full((64, 96), 1.0)})
+    assert not compared(spoiled(view), view, baseline=baseline, rules=RULES).missing_share.any()
 
 
 @pytest.mark.parametrize(("camera", "size"), [(VIEWS[0].camera, (48, 32)), (VIEWS[0].camera.resized(64, 96), (32, 48))])
 def test_pictures_are_compared_at_the_longer_side_that_is_asked_for(camera: Camera, size: tuple[int, int]) -> None:
     view = View(0, camera, torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8))
-    found = compared(view.colors, view, floor=None, rules=replace(RULES, longer_side=48))
+    found = compared(view.colors, view, baseline=None, rules=replace(RULES, longer_side=48))
     assert (found.view.camera.width, found.view.camera.height) == size
     assert found.missing_share.shape == size[::-1]
 
@@ -91,18 +93,18 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     without = {v.index: draw(world.scene.gaussians(v.camera, backend), v.camera, backend).image for v in views}
     depths = {v.index: torch.full((64, 96), torch.inf) for v in views}
     rules = replace(RULES, residual_threshold=0.05, max_contradictions=0.2, min_hits=1)
-    floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
+    baseline = BaselineResidual(1.0, {v.index: torch.zeros(64, 96) for v in views})
 
     def spawned(last: ViewResidual) -> int:
-        found = [compared(without[v.index].clamp(0, 1), v, floor=floor, rules=rules) for v in views[:-1]]
+        found = [compared(without[v.index].clamp(0, 1), v, baseline=baseline, rules=rules) for v in views[:-1]]
         return len(spawn_by_sweep([*found, last], depths, color, first_identity=0, rules=rules, backend=backend).free)
 
     last = views[-1]
     silent = nothing_missing(last)
     masked = replace(last, mask=torch.zeros(64, 96, dtype=torch.bool), image=torch.zeros_like(last.image))
-    unknown = replace(floor, maps={index: m for index, m in floor.maps.items() if index != last.index})
-    absent = compared(without[last.index].clamp(0, 1), last, floor=unknown, rules=rules)
-    seen = compared(without[last.index].clamp(0, 1), masked, floor=floor, rules=rules)
+    unknown = replace(baseline, maps={index: m for index, m in baseline.maps.items() if index != last.index})
+    absent = compared(without[last.index].clamp(0, 1), last, baseline=unknown, rules=rules)
+    seen = compared(without[last.index].clamp(0, 1), masked, baseline=baseline, rules=rules)
     assert not absent.missing_share.any()
     assert not seen.missing_share.any()
     assert spawned(absent) == spawned(seen) > spawned(silent)

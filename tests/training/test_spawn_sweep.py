@@ -12,7 +12,7 @@ from structgstream.training.online import spawn
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
-from structgstream.training.residuals import residual_floor
+from structgstream.training.residuals import baseline_residual
 from tests.support.backends import quickest_backend
 from tests.support.worlds import emerging_ball, moved_since, moving_world
 
@@ -26,8 +26,8 @@ def sweep(rules: SpawnRules = RULES) -> Sweep:
     first, views = (WORLD.views(t) for t in (0, 1))
     split = DynamicSplit.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
     active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
-    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    return Sweep(split.dynamic, split.static, views, active_tiles, floor, rules, backend)
+    baseline = baseline_residual(WORLD.scene, first, scale=1.0, backend=backend)
+    return Sweep(split.dynamic, split.static, views, active_tiles, baseline, rules, backend)
 
 
 def test_missing_is_the_ball_in_the_views_that_show_it() -> None:

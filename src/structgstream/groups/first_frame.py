@@ -36,7 +36,7 @@ from structgstream.training.online.spawn import outlier_mask, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles, with_displacements
 from structgstream.training.online.view_residuals import view_residuals
 from structgstream.training.parameters import pixel_size
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View
 
@@ -56,7 +56,7 @@ def relocate_lost_anchors(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
     rules: SpawnRules,
     backend: Backend,
 ) -> tuple[Scene, int]:
@@ -67,7 +67,7 @@ def relocate_lost_anchors(
     if pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, rules, backend)
+        outliers = _outlier_anchors(dynamic, views, active_tiles, baseline, rules, backend)
         if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
@@ -84,7 +84,7 @@ def _outlier_anchors(
     dynamic: Scene,
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
     rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
@@ -95,7 +95,7 @@ def _outlier_anchors(
         if active is None:
             continue
         (found,) = view_residuals(
-            [active.picture], [view], dynamic.camera_color, floor=floor, rules=rules, backend=backend
+            [active.picture], [view], dynamic.camera_color, baseline=baseline, rules=rules, backend=backend
         )
         small = found.view
         pixels = found.wrong.to(active.picture)
@@ -170,7 +170,7 @@ def fit_group_start(
     backend: Backend,
     seed: int,
     steps: Mapping[str, float] | None = None,
-    floor: ResidualFloor | None = None,
+    baseline: BaselineResidual | None = None,
     light: ExposureReference | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
@@ -195,7 +195,7 @@ def fit_group_start(
     optimizer = FrameOptimizer(
         each, backend, frame_index, torch.Generator().manual_seed(seed), Stopwatch(), steps or {}, on_step
     )
-    rounds = _Rounds(optimizer, scene, views, changes, floor)
+    rounds = _Rounds(optimizer, scene, views, changes, baseline)
     current, results = with_displacements(scene, displacements), list[FitResult[Scene]]()
     for number in range(start.rounds):
         results.append(rounds.run(current, again=number > 0))
@@ -211,7 +211,7 @@ class _Rounds:
     first: Scene
     views: list[View]
     changes: list[PictureChange | None]
-    floor: ResidualFloor | None
+    baseline: BaselineResidual | None
 
     def run(self, current: Scene, *, again: bool) -> FitResult[Scene]:
         """One round from ``current``, whose anchors are those of frame 0; ``again`` if it is not the first."""
@@ -231,7 +231,7 @@ class _Rounds:
                 inliers,
                 active_tiles,
                 first_identity=next_identity(current.free.births, fit.frame_index),
-                floor=self.floor,
+                baseline=self.baseline,
                 room=config.patching.max_free - len(split.static.free),
                 config=config.spawn,
                 backend=backend,
@@ -259,7 +259,7 @@ class _Rounds:
         """Dynamic: primitives that changed, have a high error or are displaced from frame 0. Static: all others."""
         fit, config = self.fit, self.fit.config
         measured = measure(
-            current, self.views, self.changes, config=config.motion, backend=fit.backend, floor=self.floor
+            current, self.views, self.changes, config=config.motion, backend=fit.backend, baseline=self.baseline
         )
         found = select_dynamic(current, measured, config=config.motion, backend=fit.backend)
         away = (current.anchors.positions != self.first.anchors.positions).any(1)
@@ -273,7 +273,7 @@ class _Rounds:
             self.first.anchors.select(split.selection.anchors),
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
-            floor=self.floor,
+            baseline=self.baseline,
             rules=config.spawn.rules,
             backend=fit.backend,
         )

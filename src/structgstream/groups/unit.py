@@ -81,8 +81,8 @@ class GroupMethod:
         return self._usual.needs_before
 
     @property
-    def needs_older(self) -> bool:
-        return self._usual.needs_older
+    def needs_before_previous(self) -> bool:
+        return self._usual.needs_before_previous
 
     def observe(
         self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
@@ -123,7 +123,7 @@ class GroupMethod:
         if entry is not None and task.frame.index == entry.frame:
             return self._begin(entry, past, task)
         if entry is not None and task.frame.index == entry.frame + 1:
-            past = replace(past, older=_older(past.state, entry.velocities), seconds=None)
+            past = replace(past, before_previous=_before_previous(past.state, entry.velocities), seconds=None)
         return StructGStream(self._config_at(task.frame.index)).next(past, task)
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
@@ -136,12 +136,12 @@ class GroupMethod:
             pictures.views,
             pictures.changes or [None] * len(pictures.views),
             frame_index=task.frame.index,
-            config=with_rate_control(self._config_at(task.frame.index).online, task.pressure),
+            config=with_rate_control(self._config_at(task.frame.index).online, task.rate_scale),
             start=self.start,
             backend=task.backend,
             seed=task.seed,
             steps=task.steps,
-            floor=past.memory.floor,
+            baseline=past.memory.baseline,
             light=past.memory.light,
             on_step=task.on_step,
         )
@@ -171,7 +171,7 @@ def lowered_start(start: GroupStartConfig) -> GroupStartConfig:
     return replace(start, births=start.births // 4)
 
 
-def _older(state: Scene, velocities: Tensor) -> Scene:
+def _before_previous(state: Scene, velocities: Tensor) -> Scene:
     """The scene one frame before ``state``, the group's first: anchors moved back by their velocities."""
     anchors = state.anchors
     positions = anchors.positions - velocities[: len(anchors)].to(anchors.positions)

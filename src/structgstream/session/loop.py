@@ -172,7 +172,7 @@ class Session(Generic[State, Memory]):
         return frame
 
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
-        """The tasks of frames; each is created after the previous frame is written, on which its pressure depends."""
+        """The tasks of frames; each is created after the previous frame is written, on which its rate scale depends."""
         for frame, pictures in observed:
             key = self._keys.kind(frame.index, frame.pts_seconds) is PacketKind.KEY
             begins = self._plan.due(frame.index, frame.pts_seconds) if key and shows_enough(frame, self._rig) else None
@@ -196,7 +196,7 @@ class Session(Generic[State, Memory]):
             self._backend,
             seed=frame_seed(pipeline.seed, frame.index),
             steps=self._steps,
-            pressure=self._controller.pressure,
+            rate_scale=self._controller.rate_scale,
             roving=partial(self._roving_pictures, frame),
             begins=begins,
             on_step=self._on_step,
@@ -247,8 +247,9 @@ class Session(Generic[State, Memory]):
             if shows:
                 self._shown.append((index, task.frame.pts_seconds))
             self._keep(index)
-            older = past.state if shows else past.older  # the scene of a held frame is the one before it
-            return Past(state, past.memory, older if method.needs_older else None, self._seconds_shown)
+            # Where too few cameras show something, the scene before is repeated.
+            earlier = past.state if shows else past.before_previous
+            return Past(state, past.memory, earlier if method.needs_before_previous else None, self._seconds_shown)
         self._begin(index, [(index, task.frame.pts_seconds)])
         self._plan.begin(index, task.frame.pts_seconds)
         self._keep(index)
@@ -295,16 +296,17 @@ class Session(Generic[State, Memory]):
         state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
         period = resumed.period(count - 1)
         first = period.first_frame
-        shown = self._last_shown(count, first) if method.needs_older else [*range(max(count - 2, first), count)]
+        needs_earlier = method.needs_before_previous
+        shown = self._last_shown(count, first) if needs_earlier else [*range(max(count - 2, first), count)]
         seconds = {info.index: info.pts_seconds for info in resumed.packets}
         # A group of frames has packets of its own frames only: when those before were shown is not known.
         self._begin(first, ((index, seconds.get(index)) for index in shown))
-        older = resumed.scene(shown[0]) if method.needs_older and len(shown) == 2 else None
+        earlier = resumed.scene(shown[0]) if needs_earlier and len(shown) == 2 else None
         self._keep(count - 1)
         if self._pipeline.period.enabled:
             self._restore_plan(resumed, period)
         memory = method.prepare(resumed.scene(first), partial(self._task_again, first))
-        return Past(state, memory, older, self._seconds_shown)
+        return Past(state, memory, earlier, self._seconds_shown)
 
     def _last_shown(self, count: int, first: int) -> list[int]:
         """The last two frames, of those from ``first`` to ``count``, whose pictures show something; the first does."""

@@ -113,7 +113,7 @@ class PeriodPlan:
         self._config = config
         self._number = 0
         self._first: tuple[int, float] | None = None  # frame and time of the period's first frame
-        self._floor = math.inf
+        self._baseline = math.inf
         self._last: deque[tuple[int, float]] = deque(maxlen=config.frames)  # frames and residuals
 
     def due(self, index: int, pts_seconds: float) -> str | None:
@@ -127,8 +127,8 @@ class PeriodPlan:
         measured = dict(self._last)
         last = [measured[frame] for frame in range(index - config.frames, index) if frame in measured]
         whole = len(last) == config.frames and index - self._first[0] >= config.frames
-        if config.residual is not None and whole and min(last) > config.residual * self._floor:
-            return f"residual {min(last) / self._floor:.2f} times the first frame's"
+        if config.residual is not None and whole and min(last) > config.residual * self._baseline:
+            return f"residual {min(last) / self._baseline:.2f} times the first frame's"
         return None
 
     def begin(self, index: int, pts_seconds: float, *, number: int | None = None) -> None:
@@ -155,7 +155,7 @@ class PeriodPlan:
     def add(self, index: int, residual: float) -> None:
         """Add the residual of a decoded frame for which :meth:`measures` is True; in order of frames."""
         if self._first is not None and index == self._first[0]:
-            self._floor = residual
+            self._baseline = residual
         self._last.append((index, residual))
 
     @property

@@ -47,7 +47,7 @@ class FrameTask:
     backend: Backend  # the compute back-end
     seed: int  # seed of all random numbers, so that a frame can be repeated separately
     steps: Mapping[str, float] = field(default_factory=dict)  # the codec's quantization steps by name; empty in frame 0
-    pressure: float = 1.0  # factor of the rate control (rate_control, Note [Pressure])
+    rate_scale: float = 1.0  # factor of the rate control (rate_control, Note [Rate scale])
     roving: Callable[[], Sequence[RovingPicture]] = tuple  # reads pictures of a roving camera; none after frame 0
     begins: str | None = None  # why the frame begins another period, in a few words (periods); None if it does not
     on_step: StepListener | None = None  # called after every optimisation step
@@ -74,19 +74,19 @@ class Past(Generic[State, Memory]):
     memory: Memory  # see Method.prepare
     # the decoded frame before that, if the method needs it and it is of the same period. Frames that show nothing,
     # whose scene is that of the frame before them, do not count for either.
-    older: State | None = None
-    # presentation times of older and state; None where one of them is unknown
+    before_previous: State | None = None
+    # presentation times of before_previous and state; None where one of them is unknown
     seconds: tuple[float, float] | None = None
 
     def intervals(self, pts_seconds: float) -> float:
-        """The time from ``state`` to a frame, as a multiple of the time from ``older`` to ``state``.
+        """The time from ``state`` to a frame, as a multiple of the time from ``before_previous`` to ``state``.
 
         Exactly 1 if they are nearly equal, and without ``seconds``; at most :data:`MAX_INTERVALS`.
         """
         if self.seconds is None or self.seconds[1] <= self.seconds[0]:
             return 1.0
-        older, state = self.seconds
-        found = (pts_seconds - state) / (state - older)
+        earlier, state = self.seconds
+        found = (pts_seconds - state) / (state - earlier)
         return 1.0 if abs(found - 1.0) <= EQUAL_INTERVALS else min(found, MAX_INTERVALS)
 
 
@@ -99,7 +99,7 @@ class Method(Protocol[State, Memory]):
         ...
 
     @property
-    def needs_older(self) -> bool:
+    def needs_before_previous(self) -> bool:
         """Whether a frame depends on the two decoded frames before it, instead of one."""
         ...
 

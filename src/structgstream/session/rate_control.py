@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rate control: adapts the weight of the rate term so that a stream meets a target rate.
 
-Note [Pressure]
-~~~~~~~~~~~~~~~
-The quantization steps of a stream are constant and stored in its header. Rate control scales the weight lambda of the
-rate term in the loss by one factor, the pressure, and the thresholds for spawning free Gaussians by its square root: by
-gradients (``patching.grad_threshold``) and, above 1, by missing content (``spawn.missing_threshold``), since a new
-Gaussian takes about 9 bytes at every pressure. At 1 all have the configuration's values. The pressure is a function of
-the sizes of earlier packets only, so that a resumed stream is identical.
+Note [Rate scale]
+~~~~~~~~~~~~~~~~~
+The quantization steps of a stream are constant and stored in its header. Rate control multiplies the weight lambda of
+the rate term in the loss by one factor, the rate scale, and the thresholds for spawning free Gaussians by its square
+root: by gradients (``patching.grad_threshold``) and, above 1, by missing content (``spawn.missing_threshold``), since a
+new Gaussian takes about 9 bytes at every rate scale. At 1 all have the configuration's values. The rate scale is a
+function of the sizes of earlier packets only, so that a resumed stream is identical.
 
 Note [Windows]
-~~~~~~~~~~~~~~
+~~~~~~~~~~~~~~~
 The budget of a delta packet is computed from a window that ends a third of its length in the future. The sizes of its
 past packets are known, and the size of a key packet in its future part is predicted. The delta packets of the future
 part share the remainder. So bytes are saved before a key packet comes. A key packet contains all changes since frame 0;
@@ -42,7 +42,7 @@ LEAST, MOST = 1.0 / 16.0, 1024.0
 _AHEAD = 1.0 / 3.0
 """Share of the window that lies in the future."""
 _FALL, _RISE = 0.5, 4.0
-"""Bounds of the factor by which the pressure changes per frame."""
+"""Bounds of the factor by which the rate scale changes per frame."""
 _MISSED = 1.1
 """A window above this multiple of its budget has missed the target."""
 
@@ -68,15 +68,15 @@ class RateConfig:
 
 
 class RateController:
-    """Computes the pressure of the next frame from the sizes of all packets in order.
+    """Computes the rate scale of the next frame from the sizes of all packets in order.
 
-    The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
+    The rate scale is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
     about the cube root of lambda, so each step corrects about a third of the excess. ``keys`` must receive each packet
     before this object does. A warning is logged when the target starts to be missed.
     """
 
     def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:
-        self.pressure = 1.0
+        self.rate_scale = 1.0
         """From :data:`LEAST` to :data:`MOST`."""
         self._budget: float | None = None  # bytes per frame of the media
         if config.target_mbits is None:
@@ -88,7 +88,7 @@ class RateController:
         self._now = 0, 0.0  # number and time of the last packet
         self._origin = 0  # place of the period's first packet
         self._key: tuple[int, int] | None = None  # size of the last key packet, and its distance from the origin
-        self._delta: tuple[int, float] | None = None  # size of the last delta packet, and its pressure
+        self._delta: tuple[int, float] | None = None  # size of the last delta packet, and its rate scale
         self._usual = 0.0  # size of delta packets, a running mean
         self._warned = False
 
@@ -103,13 +103,13 @@ class RateController:
         self._now = index, pts_seconds
         if kind is PacketKind.DELTA:
             self._usual = size if self._delta is None else 0.8 * self._usual + 0.2 * size
-            self._delta = size, self.pressure
+            self._delta = size, self.rate_scale
         elif place > self._origin:  # A period's first packet is nearly empty, because the header contains its fields.
             self._key = size, place - self._origin
         if self._delta is not None:
-            last, pressure = self._delta
+            last, rate_scale = self._delta
             factor = min(max(last / self._room(self._budget), _FALL), _RISE)
-            self.pressure = min(max(pressure * factor, LEAST), MOST)
+            self.rate_scale = min(max(rate_scale * factor, LEAST), MOST)
         self._warn_if_missed(index, self._budget)
 
     def _warn_if_missed(self, index: int, budget: float) -> None:
@@ -128,7 +128,7 @@ class RateController:
                 len(packets),
                 rate * 8e-6 * self._fps,
                 budget * 8e-6 * self._fps,
-                remedy if self.pressure == MOST else "bytes are saved from now on",
+                remedy if self.rate_scale == MOST else "bytes are saved from now on",
             )
         self._warned = missed
 
@@ -175,14 +175,14 @@ class RateController:
         return packets[-1].place - packets[0].place + self._spacing if packets else 0.0
 
 
-def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
-    """``config``, its rate weight times ``pressure`` and its thresholds for spawning times the square root of that."""
-    if pressure == 1.0:
+def with_rate_control(config: OnlineConfig, rate_scale: float) -> OnlineConfig:
+    """``config``, its rate weight times ``rate_scale`` and its thresholds for spawning times its square root."""
+    if rate_scale == 1.0:
         return config
     rounding, patching, spawn = config.rounding, config.patching, config.spawn
     return replace(
         config,
-        rounding=replace(rounding, rate_weight=rounding.rate_weight * pressure),
-        patching=replace(patching, grad_threshold=patching.grad_threshold * pressure**0.5),
-        spawn=replace(spawn, missing_threshold=spawn.missing_threshold * max(1.0, pressure) ** 0.5),
+        rounding=replace(rounding, rate_weight=rounding.rate_weight * rate_scale),
+        patching=replace(patching, grad_threshold=patching.grad_threshold * rate_scale**0.5),
+        spawn=replace(spawn, missing_threshold=spawn.missing_threshold * max(1.0, rate_scale) ** 0.5),
     )

@@ -34,13 +34,18 @@ from structgstream.session.pipeline import FrameTask, Past, Pipeline, StreamFact
 from structgstream.session.presets import StreamConfig, to_json
 from structgstream.session.rate_control import with_rate_control
 from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
-from structgstream.training.frame0.quantization import Sensitivity, estimate_sensitivity, quantize_first_frame, regauge
+from structgstream.training.frame0.quantization import (
+    Sensitivity,
+    estimate_sensitivity,
+    quantize_first_frame,
+    whiten_features,
+)
 from structgstream.training.frame0.seeding import fit_environment
 from structgstream.training.online.exposure import ExposureReference, exposure_reference
-from structgstream.training.online.fit import fit_next_frame, needs_older
+from structgstream.training.online.fit import fit_next_frame, needs_before_previous
 from structgstream.training.online.preprocess import FramePictures, preprocess
 from structgstream.training.parameters import pixel_size
-from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
+from structgstream.training.residuals import BaselineResidual, baseline_residual, mean_residual
 from structgstream.training.result import FitResult
 from structgstream.training.views import View
 
@@ -82,7 +87,7 @@ class SceneCodec:
             scene = self._with_dynamic_fields(fitted)
         else:
             measured = estimate_sensitivity(fitted, task.rig, backend=task.backend, seed=task.seed)
-            scene, sensitivity = regauge(fitted, measured)
+            scene, sensitivity = whiten_features(fitted, measured)
             scene = self._with_dynamic_fields(scene)
             steps = self._packet_steps(scene, task.rig)
             scene, init_steps = self._quantized(scene, sensitivity, steps)
@@ -144,7 +149,7 @@ class SceneCodec:
 class FrameZeroContext:
     """The data of a period's first frame that later frames need in addition to its scene; None if not used."""
 
-    floor: ResidualFloor | None = None  # baseline residuals
+    baseline: BaselineResidual | None = None
     light: ExposureReference | None = None  # exposure reference: its pictures and F_c
 
 
@@ -163,8 +168,8 @@ class StructGStream:
         return self.config.online.motion.enabled
 
     @property
-    def needs_older(self) -> bool:
-        return needs_older(self.config.online)
+    def needs_before_previous(self) -> bool:
+        return needs_before_previous(self.config.online)
 
     def observe(
         self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
@@ -207,10 +212,10 @@ class StructGStream:
             return FrameZeroContext()
         first = task()
         scene, views, backend = self._filtered(state, first), first.pictures.views, first.backend
-        floor = None
+        baseline = None
         if motion.residual_threshold > 0.0:
-            floor = residual_floor(scene, views, scale=motion.picture_scale, backend=backend)
-        return FrameZeroContext(floor, exposure_reference(scene, views, config=light) if light.enabled else None)
+            baseline = baseline_residual(scene, views, scale=motion.picture_scale, backend=backend)
+        return FrameZeroContext(baseline, exposure_reference(scene, views, config=light) if light.enabled else None)
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         """Fit a later frame."""
@@ -221,14 +226,14 @@ class StructGStream:
             on_device(past.state, device),
             task.frame,
             task.rig,
-            config=with_rate_control(self.config.online, task.pressure),
+            config=with_rate_control(self.config.online, task.rate_scale),
             backend=task.backend,
             seed=task.seed,
             pictures=task.pictures,
             steps=task.steps,
-            floor=past.memory.floor,
+            baseline=past.memory.baseline,
             light=past.memory.light,
-            older=None if past.older is None else on_device(past.older, device),
+            before_previous=None if past.before_previous is None else on_device(past.before_previous, device),
             intervals=past.intervals(task.frame.pts_seconds),
             on_step=task.on_step,
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals of renderings against the training pictures, and their floor: the residuals of frame 0.
+"""Residuals of renderings against the training pictures, and their baseline: the residuals of frame 0.
 
 Residuals that frame 0 already had do not indicate change.
 """
@@ -16,12 +16,12 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.views import View, dilated, in_groups, stacked_masks
 
-FLOOR_PIXELS = 5
-"""Side, in pixels of its maps, of the square over which the floor takes the maximum residual."""
+BASELINE_PIXELS = 5
+"""Side, in pixels of its maps, of the square over which the baseline takes the maximum residual."""
 
 
 @dataclass(frozen=True)
-class ResidualFloor:
+class BaselineResidual:
     """Residuals of frame 0 by training view.
 
     Args:
@@ -33,29 +33,31 @@ class ResidualFloor:
     scale: float
     maps: dict[int, Tensor]
 
-    def eased(self, changed: Mapping[int, Tensor], *, medians: float) -> "ResidualFloor":
-        """The floor, with at most ``medians`` times a view's median where it has changed.
+    def capped(self, changed: Mapping[int, Tensor], *, medians: float) -> "BaselineResidual":
+        """The baseline, with at most ``medians`` times a view's median where it has changed.
 
         Frame 0's residual there was of other content, and does not show how well the present content can be drawn.
 
         Args:
             changed: by view index, mask ``[h, w]`` of the changed pixels, at the maps' scale.
-            medians: 0: no floor there.
+            medians: 0: no baseline there.
         """
         changed = {index: mask for index, mask in changed.items() if index in self.maps}
 
-        def eased(indices: list[int]) -> Tensor:
-            floors = torch.stack([self.maps[index] for index in indices])
-            # Without what a mask left out. No median (everything is left out): fmin then keeps the floor.
-            usual = medians * torch.where(floors < 1.0, floors, torch.nan).flatten(1).nanmedian(1).values
+        def capped(indices: list[int]) -> Tensor:
+            baselines = torch.stack([self.maps[index] for index in indices])
+            # Without what a mask left out. No median (everything is left out): fmin then keeps the baseline.
+            usual = medians * torch.where(baselines < 1.0, baselines, torch.nan).flatten(1).nanmedian(1).values
             return torch.where(
-                torch.stack([changed[index] for index in indices]), torch.fmin(floors, usual[:, None, None]), floors
+                torch.stack([changed[index] for index in indices]),
+                torch.fmin(baselines, usual[:, None, None]),
+                baselines,
             )
 
         if not changed:
             return self
         device = next(iter(self.maps.values())).device
-        found = in_groups(list(changed), lambda index: self.maps[index].shape, eased, device=device)
+        found = in_groups(list(changed), lambda index: self.maps[index].shape, capped, device=device)
         return replace(self, maps={**self.maps, **dict(zip(changed, found, strict=True))})
 
 
@@ -109,13 +111,13 @@ def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend:
     return sum(sums) / max(len(sums), 1)
 
 
-def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
+def baseline_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> BaselineResidual:
     """Residuals of ``scene``, the decoded frame 0, in pictures reduced by ``scale`` (``View.evidence``)."""
     maps = {}
     for view, found in _reduced_residuals(scene, views, scale, backend):
-        floor = dilated(found, FLOOR_PIXELS // 2)
-        maps[view.index] = floor if view.mask is None else torch.where(view.mask, floor, 1.0)
-    return ResidualFloor(scale, maps)
+        baseline = dilated(found, BASELINE_PIXELS // 2)
+        maps[view.index] = baseline if view.mask is None else torch.where(view.mask, baseline, 1.0)
+    return BaselineResidual(scale, maps)
 
 
 def _reduced_residuals(

@@ -87,7 +87,7 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
     return Sensitivity(squares, products, used)
 
 
-def regauge(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
+def whiten_features(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
     """An equivalent scene whose values cost fewer bits (Note [Gauges]), and its sensitivity."""
     anchors, fields = scene.anchors, dict(sensitivity.fields)
     lengths = anchors.log_offset_scales.exp()[:, None]
@@ -146,7 +146,7 @@ def quantize_first_frame(
     """Quantizes the fields that the init record codes; returns the dequantized scene and the steps by field.
 
     Args:
-        scene: frame 0, as :func:`regauge` returned it.
+        scene: frame 0, as :func:`whiten_features` returned it.
         sensitivity: of ``scene``.
         config: allowed error and fixed steps.
         voxel_size: the grid of the anchors.

@@ -158,12 +158,12 @@ class SpawnConfig:
     """Largest number of Gaussians that are spawned in a frame."""
     missing_threshold: float = 0.10
     """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing; thin content needs less in
-    proportion. Rate control raises it (``rate_control``, Note [Pressure])."""
+    proportion. Rate control raises it (``rate_control``, Note [Rate scale])."""
     thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
 
     RULES: ClassVar[SpawnRules] = SpawnRules()
     """Of the first sweep."""
-    CHANGED_FLOOR_MEDIANS: ClassVar[float] = 1.0
+    BASELINE_CAP_MEDIANS: ClassVar[float] = 1.0
     """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
     of its view's. In the sweep for thin content all of it counts."""
 

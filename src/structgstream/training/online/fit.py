@@ -28,7 +28,7 @@ from structgstream.training.online.select import select_dynamic
 from structgstream.training.online.spawn import prune_and_spawn
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.parameters import detached
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 
 
@@ -42,9 +42,9 @@ def fit_next_frame(
     seed: int,
     pictures: FramePictures | None = None,
     steps: Mapping[str, float] | None = None,
-    older: Scene | None = None,
+    before_previous: Scene | None = None,
     intervals: float = 1.0,
-    floor: ResidualFloor | None = None,
+    baseline: BaselineResidual | None = None,
     light: ExposureReference | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
@@ -60,9 +60,9 @@ def fit_next_frame(
         pictures: of ``frame``, and their changes since the previous one for motion selection (``config.motion``;
             :func:`~structgstream.training.online.preprocess.preprocess`); without them everything is trained.
         steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
-        older: the decoded scene two frames before, if :func:`needs_older`; None for none.
+        before_previous: the decoded scene two frames before, if :func:`needs_before_previous`; None for none.
         intervals: media time since the previous frame, in times of that between the two before, for the motion prior.
-        floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for spawning; None for none.
+        baseline: residuals of frame 0, for ``config.motion.residual_threshold`` and for spawning; None for none.
         light: frame 0's, for ``config.exposure``; None for none.
         on_step: called after every iteration, or every tenth of native ones.
     """
@@ -84,14 +84,16 @@ def fit_next_frame(
 
     watch, generator = Stopwatch(), torch.Generator().manual_seed(seed)
     optimizer = FrameOptimizer(config, backend, frame.index, generator, watch, steps or {}, on_step)
-    prior = prior_displacements(scene, older, intervals * config.motion_prior)
+    prior = prior_displacements(scene, before_previous, intervals * config.motion_prior)
     if pictures.changes is None:
         result = optimizer.run(StartingPoint(scene, views, prior))
         return replace(result, counts={**result.counts, **light_counts})
 
     with watch.stage("select"):
-        measured = measure(scene, views, pictures.changes, config=config.motion, backend=backend, floor=floor)
-        selection = select_dynamic(scene, measured, config=config.motion, backend=backend, older=older)
+        measured = measure(scene, views, pictures.changes, config=config.motion, backend=backend, baseline=baseline)
+        selection = select_dynamic(
+            scene, measured, config=config.motion, backend=backend, before_previous=before_previous
+        )
         split = DynamicSplit.of(scene, selection)
         inliers = [views[number] for number in selection.inliers]
     with watch.stage("scene flow"):
@@ -106,7 +108,7 @@ def fit_next_frame(
             swept,
             flow.active_tiles,
             first_identity=frame.index * IDS_PER_FRAME,
-            floor=floor,
+            baseline=baseline,
             room=config.patching.max_free - len(split.static.free),
             config=config.spawn,
             backend=backend,
@@ -145,14 +147,14 @@ def held(scene: Scene) -> FitResult[Scene]:
     return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"held": 1})
 
 
-def needs_older(config: OnlineConfig) -> bool:
+def needs_before_previous(config: OnlineConfig) -> bool:
     """Whether a frame depends on the two decoded frames before it, instead of one."""
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.hysteresis != 1.0)
 
 
-def prior_displacements(scene: Scene, older: Scene | None, share: float) -> Tensor:
+def prior_displacements(scene: Scene, before_previous: Scene | None, share: float) -> Tensor:
     """The motion prior ``[M + F, 3]``: ``share`` of the anchors' last displacement, and 0 for free Gaussians."""
     displacements = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
-    if older is not None and share:
-        displacements[: len(scene.anchors)] = share * (scene.anchors.positions - older.anchors.positions)
+    if before_previous is not None and share:
+        displacements[: len(scene.anchors)] = share * (scene.anchors.positions - before_previous.anchors.positions)
     return displacements

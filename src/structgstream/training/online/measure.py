@@ -19,7 +19,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.preprocess import PictureChange
-from structgstream.training.residuals import ResidualFloor, residuals
+from structgstream.training.residuals import BaselineResidual, residuals
 from structgstream.training.views import (
     View,
     area_mean,
@@ -146,7 +146,7 @@ def measure(
     *,
     config: MotionConfig,
     backend: Backend,
-    floor: ResidualFloor | None = None,
+    baseline: BaselineResidual | None = None,
 ) -> list[ViewMeasurement]:
     """Draw ``scene`` for each view once, and accumulate changed pixels and flow per primitive.
 
@@ -159,20 +159,20 @@ def measure(
         changes: of each view since the previous frame.
         config: sizes and thresholds.
         backend: the compute back-end.
-        floor: residuals of frame 0, for ``residual_threshold``; None for none.
+        baseline: residuals of frame 0, for ``residual_threshold``; None for none.
     """
     folded = scene.with_folded_appearance()
 
     def kind(given: tuple[View, PictureChange | None]) -> Hashable:
         view, change = given
-        new = floor is None or view.index not in floor.maps
+        new = baseline is None or view.index not in baseline.maps
         return view.image.shape, view.camera.near, change is None, change is None or change.flow is None, new
 
     with torch.no_grad():
         measured = in_groups(
             list(zip(views, changes, strict=True)),
             kind,
-            lambda alike: _measure_views(folded, *zip(*alike), config=config, backend=backend, floor=floor),
+            lambda alike: _measure_views(folded, *zip(*alike), config=config, backend=backend, baseline=baseline),
             device=backend.device,
         )
         shares = torch.stack([of_view.shares for of_view in measured]).tolist()
@@ -204,9 +204,9 @@ def _measure_views(
     *,
     config: MotionConfig,
     backend: Backend,
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
 ) -> list[_Measured]:
-    """Of views of one size, all or none of which have a change, flow and a floor."""
+    """Of views of one size, all or none of which have a change, flow and a baseline."""
     small = evidence_views(views, config.picture_scale)
     cameras, masks = [view.camera for view in small], stacked_masks(small)
     gaussians = scene.gaussians_of_views(cameras, backend)
@@ -231,9 +231,9 @@ def _measure_views(
         gaussians, viewports, torch.cat(maps, dim=-1), slots=slots, backgrounds=backgrounds
     )
     wrong_shares = torch.zeros_like(changed_shares)
-    if floor is not None and views[0].index in floor.maps and config.residual_threshold > 0.0:
-        floors = torch.stack([floor.maps[view.index] for view in views])
-        wrong = residuals(list(drawn), small, scene.camera_color, backend) > config.residual_threshold + floors
+    if baseline is not None and views[0].index in baseline.maps and config.residual_threshold > 0.0:
+        baselines = torch.stack([baseline.maps[view.index] for view in views])
+        wrong = residuals(list(drawn), small, scene.camera_color, backend) > config.residual_threshold + baselines
         wrong_shares = mean_of_counting(wrong.to(changed), masks)
         around = torch.maximum(changed, dilated(wrong, 1).to(changed))
         # The pictures had to be drawn first; the few pixels in question are accumulated by themselves.

@@ -110,7 +110,7 @@ def select_dynamic(
     *,
     config: MotionConfig,
     backend: Backend,
-    older: Scene | None = None,
+    before_previous: Scene | None = None,
 ) -> DynamicSelection:
     """The dynamic primitives of ``scene``, by what each view has measured.
 
@@ -119,12 +119,12 @@ def select_dynamic(
         measured: by :func:`~structgstream.training.online.measure.measure`, of each view.
         config: thresholds.
         backend: the compute back-end.
-        older: the scene two frames before, for ``hysteresis``; None for none.
+        before_previous: the scene two frames before, for ``hysteresis``; None for none.
     """
     anchors = len(scene.anchors)
-    ease = torch.ones(anchors + len(scene.free), device=scene.anchors.positions.device)
-    if older is not None:
-        ease = torch.where(changed_primitives(older, scene), config.hysteresis, ease)
+    scale = torch.ones(anchors + len(scene.free), device=scene.anchors.positions.device)
+    if before_previous is not None:
+        scale = torch.where(changed_primitives(before_previous, scene), config.hysteresis, scale)
 
     view_changes = [of_view.change for of_view in measured]
     for number in outlier_candidates(view_changes):
@@ -134,11 +134,11 @@ def select_dynamic(
 
     used = [measured[number] for number in inliers]
     # No rows come first, because every inlier may be a camera that was absent from the previous frame.
-    none = ease.new_zeros(0, 2, len(ease))
+    none = scale.new_zeros(0, 2, len(scale))
     votes = [torch.stack([m.covered, m.covered_changed])[None] for m in used if m.covered_changed is not None]
     covered, covered_changed = torch.cat([none, *votes]).unbind(1)
-    moves = covered_changed > config.MIN_CHANGED_PIXELS * ease
-    moves &= covered_changed > config.MIN_CHANGED_SHARE * ease * covered
+    moves = covered_changed > config.MIN_CHANGED_PIXELS * scale
+    moves &= covered_changed > config.MIN_CHANGED_SHARE * scale * covered
     # From here on masks lie on the processor, where rows are counted without waiting for a GPU.
     positions, dynamic, shown = on_processor(
         scene.anchors.positions,
@@ -169,8 +169,8 @@ def select_dynamic(
     )
 
 
-def changed_primitives(older: Scene, scene: Scene) -> Tensor:
-    """Mask ``[M + F]``, anchors before free Gaussians, of the primitives that ``older`` lacks or has changed."""
+def changed_primitives(earlier: Scene, scene: Scene) -> Tensor:
+    """Mask ``[M + F]``, anchors before free Gaussians, of the primitives that ``earlier`` lacks or has changed."""
 
     def changed_rows(granularity: Granularity, now: object, then: object) -> Tensor:
         names = [p.attribute for p in parameters_of(fields_of(granularity)) if p.step]
@@ -178,10 +178,10 @@ def changed_primitives(older: Scene, scene: Scene) -> Tensor:
         changes = [one != other for one, other in pairs if one is not None and other is not None]
         return torch.stack([change if change.dim() == 1 else change.any(1) for change in changes]).any(0)
 
-    anchors, births = changed_rows("anchor", scene.anchors, older.anchors), scene.free.births
-    if not len(births) or not len(older.free):
+    anchors, births = changed_rows("anchor", scene.anchors, earlier.anchors), scene.free.births
+    if not len(births) or not len(earlier.free):
         return torch.cat([anchors, torch.ones_like(births, dtype=torch.bool)])
-    before = older.free.select(torch.searchsorted(older.free.births, births).clamp(max=len(older.free) - 1))
+    before = earlier.free.select(torch.searchsorted(earlier.free.births, births).clamp(max=len(earlier.free) - 1))
     return torch.cat([anchors, (before.births != births) | changed_rows("free", scene.free, before)])
 
 

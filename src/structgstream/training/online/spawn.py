@@ -29,7 +29,7 @@ from structgstream.training.online.config import SpawnConfig, SpawnRules
 from structgstream.training.online.measure import VISIBLE_PIXELS, slot_count
 from structgstream.training.online.split import DynamicSplit, changed_tiles
 from structgstream.training.online.view_residuals import ViewResidual, view_residuals
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.residuals import BaselineResidual
 from structgstream.training.views import View, by_size, in_groups, stacked_masks
 
 HIT_VOXELS = 1.8
@@ -243,7 +243,7 @@ class Sweep:
         static: the rest, with folded appearance.
         views: inliers, those with flow if there are any.
         active_tiles: by view index, the tiles that the dynamic part reaches.
-        floor: residuals of frame 0; None for none.
+        baseline: residuals of frame 0; None for none.
         rules: the rules.
         backend: the compute back-end.
     """
@@ -252,7 +252,7 @@ class Sweep:
     static: Scene
     views: Sequence[View]
     active_tiles: Mapping[int, ActiveTiles]
-    floor: ResidualFloor | None
+    baseline: BaselineResidual | None
     rules: SpawnRules
     backend: Backend
 
@@ -366,7 +366,7 @@ class Sweep:
             images,
             views,
             self.dynamic.camera_color,
-            floor=self.floor,
+            baseline=self.baseline,
             rules=self.rules,
             backend=self.backend,
             tiles=[None if active is None else active.tiles for active in actives],
@@ -449,7 +449,7 @@ def prune_and_spawn(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     first_identity: int,
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
     room: int,
     config: SpawnConfig,
     backend: Backend,
@@ -461,7 +461,7 @@ def prune_and_spawn(
         views: inliers, those with flow if there are any.
         active_tiles: by view index, the tiles that the dynamic part reaches.
         first_identity: identity of the first new Gaussian.
-        floor: residuals of frame 0; None for none.
+        baseline: residuals of frame 0; None for none.
         room: largest number of new Gaussians.
         config: the rules.
         backend: the compute back-end.
@@ -472,9 +472,9 @@ def prune_and_spawn(
     if not config.enabled or not active_tiles:
         return none
     with torch.no_grad():
-        rules, medians = config.rules, config.CHANGED_FLOOR_MEDIANS
-        eased = None if floor is None else floor.eased(split.selection.changed, medians=medians)
-        sweep = Sweep(dynamic, static, views, active_tiles, eased, rules, backend)
+        rules, medians = config.rules, config.BASELINE_CAP_MEDIANS
+        capped = None if baseline is None else baseline.capped(split.selection.changed, medians=medians)
+        sweep = Sweep(dynamic, static, views, active_tiles, capped, rules, backend)
         missing = sweep.missing()
         if missing_share(missing) > rules.max_missing_share:
             return replace(none, refused=True)
@@ -489,8 +489,8 @@ def prune_and_spawn(
         large = sweep.spawn(missing, first_identity=first_identity, room=room)
         if len(large.free) or not config.thin.enabled:
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
-        # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
-        sweep = replace(sweep, floor=floor, rules=config.thin_rules)
+        # With the whole baseline: at these low thresholds a capped one would take all that moves for thin content.
+        sweep = replace(sweep, baseline=baseline, rules=config.thin_rules)
         missing = sweep.missing(prunes=False, known=missing)
         if missing_share(missing) > sweep.rules.max_missing_share:
             return replace(none, kept=kept)

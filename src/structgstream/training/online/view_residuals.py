@@ -12,7 +12,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import TileSelection
 from structgstream.scene.color import CameraColor
 from structgstream.training.online.config import SpawnRules
-from structgstream.training.residuals import ResidualFloor, box_mean
+from structgstream.training.residuals import BaselineResidual, box_mean
 from structgstream.training.views import View, in_groups, mean_of_counting, reduced_views, stacked_masks
 
 MASK_PIXELS = 5
@@ -41,7 +41,7 @@ def view_residuals(
     views: Sequence[View],
     color: CameraColor,
     *,
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
     rules: SpawnRules,
     backend: Backend,
     tiles: Sequence[TileSelection | None] | None = None,
@@ -52,7 +52,7 @@ def view_residuals(
         drawn: by view, the rendering; None for one that is the picture itself.
         views: in full size.
         color: the colour correction of the cameras.
-        floor: residuals of frame 0; None for none.
+        baseline: residuals of frame 0; None for none.
         rules: the rules.
         backend: the compute back-end.
         tiles: by view, the tiles that were drawn; elsewhere it is the picture. None for all.
@@ -61,12 +61,12 @@ def view_residuals(
 
     def kind(of_view: tuple[Tensor | None, View, TileSelection | None]) -> Hashable:
         image, view, _ = of_view
-        return view.image.shape, image is None, floor is not None and view.index not in floor.maps
+        return view.image.shape, image is None, baseline is not None and view.index not in baseline.maps
 
     return in_groups(
         given,
         kind,
-        lambda alike: _view_residuals(alike, color, floor, rules, backend),
+        lambda alike: _view_residuals(alike, color, baseline, rules, backend),
         device=backend.device,
     )
 
@@ -74,17 +74,17 @@ def view_residuals(
 def _view_residuals(
     given: Sequence[tuple[Tensor | None, View, TileSelection | None]],
     color: CameraColor,
-    floor: ResidualFloor | None,
+    baseline: BaselineResidual | None,
     rules: SpawnRules,
     backend: Backend,
 ) -> list[ViewResidual]:
-    """Of views of one size, all or none of which were drawn and have a floor."""
+    """Of views of one size, all or none of which were drawn and have a baseline."""
     views = [view for _, view, _ in given]
     small = reduced_views(views, min(1.0, rules.longer_side / max(views[0].camera.width, views[0].camera.height)))
     pictures, masks = torch.stack([view.image for view in small]), stacked_masks(small)
     images = [image for image, _, _ in given if image is not None]
     selected = [of_view for _, _, of_view in given if of_view is not None]
-    if not images or (floor is not None and views[0].index not in floor.maps):
+    if not images or (baseline is not None and views[0].index not in baseline.maps):
         # Of a camera that was absent from frame 0 nothing is known to be new.
         none = torch.zeros(pictures.shape[:3], device=pictures.device)
         nothing = torch.zeros_like(none, dtype=torch.bool)
@@ -102,9 +102,9 @@ def _view_residuals(
         masks=masks,
     )
     limits = off.new_full((), rules.missing_threshold)
-    if floor is not None:
-        floors = torch.stack([floor.maps[view.index] for view in views])[:, None]
-        limits = limits + interpolate(floors, size=off.shape[1:], mode="bilinear")[:, 0]
+    if baseline is not None:
+        baselines = torch.stack([baseline.maps[view.index] for view in views])[:, None]
+        limits = limits + interpolate(baselines, size=off.shape[1:], mode="bilinear")[:, 0]
     missing = box_mean((off > limits).float(), MASK_PIXELS)
     missing = missing if masks is None else missing * masks
     shares = mean_of_counting((missing > 0.5).float(), masks).tolist()

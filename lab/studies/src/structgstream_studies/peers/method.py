@@ -57,7 +57,7 @@ class PicturesOnly:
     """Base of peers: they need only the training views, and only one previous frame."""
 
     needs_before = False
-    needs_older = False
+    needs_before_previous = False
 
     def observe(
         self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
