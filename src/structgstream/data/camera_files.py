@@ -9,8 +9,9 @@
     FRAME/CAMERA.jpg         a folder of pictures per frame (frame000000/images/CAMERA.png of 3DGStream)
     CAMERA.jpg               one picture per camera
 
-in the folder itself or in one below it: of a name of :data:`ROOTS`, or the only one that holds videos. Two files of one
-name, a link to a file that is not there, or several takes are a ``CaptureError``.
+in the folder itself, in one of a name of :data:`ROOTS` in it, or in the only one, up to two levels below, that holds
+several videos or several folders of pictures. Two files of one name, a link to a file that is not there, or several
+takes are a ``CaptureError``.
 """
 
 from collections.abc import Collection, Iterable, Iterator

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame 0 with less of the sensors' noise: where its pictures stand still, they are means over the frames after it.
+"""Frame 0 with less sensor noise: pixels that stand still become means over frame 0 and the frames after it.
 
 Note [Means of still pixels]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~
@@ -50,7 +50,7 @@ class DenoisingConfig:
 
 @dataclass(frozen=True)
 class Denoised(SourceWrapper):
-    """The same frames; the training pictures of those of the numbers ``at`` are means over the frames after them."""
+    """The same frames; the training pictures of the frames ``at`` are means over these and the frames after them."""
 
     config: DenoisingConfig
     at: tuple[int, ...]
@@ -86,7 +86,7 @@ def mean_of_still(
 ) -> MultiViewFrame:
     """``frame`` with the means of its pixels over the frames ``later``, as long as they stand still, rounded to 8 bits.
 
-    As many of ``later`` are read as ``config`` says; pictures of other cameras than ``names`` stay. ``mean_of`` of the
+    ``config.frames - 1`` of ``later`` are read; pictures of other cameras than ``names`` stay. ``mean_of`` of the
     result is the mean number of pictures over which a pixel was averaged.
     """
     sums = {name: _Sum(frame.images[name], frame.masks.get(name), config) for name in names if name in frame.images}

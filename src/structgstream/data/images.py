@@ -153,7 +153,7 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
     everywhere.
 
     Args:
-        bits: of which the values of pictures of 16 bits are (:func:`significant_bits`).
+        bits: how many bits the values of 16-bit files use (:func:`significant_bits`).
     """
     cv2 = opencv()
     stored = stored_picture(path)

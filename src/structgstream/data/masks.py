@@ -8,7 +8,8 @@
                               each frame), of a video the frame's number in it, from 0
 
 They are of the pictures or videos as they are shown, turned where those are, before undistortion. Where a camera has
-both, both hold. One that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
+both, both hold. A mask that cannot be read, of another size or format, or of no camera is a ``CaptureError``, and so
+is a folder without a mask of any frame; single masks of no frame are left out with a warning.
 Live cameras have no numbered frames, so only masks for all frames count.
 """
 
@@ -89,7 +90,7 @@ class MaskedSource(SourceWrapper):
 def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
     """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is neither black nor transparent."""
     cv2, data = opencv(), np.frombuffer(read_bytes(file, what="mask"), np.uint8)
-    # As stored: a conversion to 8 bits would make small numbers of 16, and all that alpha hides, count otherwise.
+    # As stored: a conversion to 8 bits without alpha would turn small 16-bit values to black, and drop transparency.
     picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if picture is None:
         raise CaptureError(f"The mask {file} cannot be decoded ({len(data)} bytes); write it again as PNG.")

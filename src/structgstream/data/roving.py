@@ -40,7 +40,7 @@ CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which two pixels of the re
 REDUCED_SIDE = 160  # pixels, to which the longer side is reduced
 REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
 DEPTHS = 96  # places on a ray, evenly in the logarithm of depth: 5 % apart, less than people are thick
-FAR_NEARS = 96.0  # near planes to the farthest place on a ray, which is as far as all still cameras at least
+FAR_NEARS = 96.0  # near planes to the farthest place on a ray; twice the distance of the farthest camera if larger
 MIN_SEEN = 2  # still cameras that see a place
 MATCHED_SHARE = 0.02  # matched points of what moves, for each of the hull, below which the hull's are added
 NEAR_SHARE = 0.25  # of the near plane of the still cameras: one walks closer to things
@@ -100,8 +100,8 @@ class WithRoving(SourceWrapper):
         return RovingPicture(camera, image, shown & ~passes_through(camera, self.rig, changed))
 
     def _changed(self, frame: MultiViewFrame) -> dict[str, NDArray[np.bool_]]:
-        """Where each training camera's picture of ``frame``, reduced, differs from what stands still; nothing for one
-        frame."""
+        """Where each training camera's picture of ``frame``, reduced, differs from what stands still; empty if the
+        capture has fewer than :data:`MIN_INSTANTS` frames."""
         if len(self.whole) < MIN_INSTANTS:
             return {}
         return {

@@ -137,14 +137,15 @@ def common_slots(slots: Slots, *, where: str, label: Callable[[int], str], train
 
     It begins where the last camera begins, and ends where most cameras have ended: with the last slot that at least
     half of the cameras, and two of those for training, reach. Cameras are absent from the slots in between that they
-    lack. What is left out, and which cameras are absent from when on, is logged once for each camera.
+    lack. Frames that are left out and absent cameras are logged, a camera that lacks frames with a line of its own, or
+    in one line with the others if more than :data:`MAX_SINGLE` do.
 
     Args:
         label: names the instant of a slot, for messages ("at 0.133 s", "000017").
         training: names of the cameras that are not held out.
 
     Raises:
-        CaptureError: no camera pictures, no frames in common, or two frames of a camera for one slot.
+        CaptureError: a camera without frames, no frames in common, or two frames of a camera for one slot.
     """
     for camera, own in slots.items():
         if not own:

@@ -273,8 +273,12 @@ def primaries_of(frame: "VideoFrame") -> int:
 
 
 def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
-    """What a video states of its colours by one of its frames, in words; None where none decodes. Raises CaptureError
-    for a transfer function or a matrix that is not converted, and for wide primaries without HLG or PQ."""
+    """What a video states of its colours, in words; ``frame`` is one of its frames, None if none decodes.
+
+    Raises:
+        CaptureError: a transfer function or a matrix that is not converted, the primaries of BT.2020 without HLG or PQ,
+            or those of DCI-P3.
+    """
     if frame is None:
         return "no frame decodes"
     transfer, primaries = transfer_of(frame), primaries_of(frame)

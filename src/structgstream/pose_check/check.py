@@ -9,10 +9,10 @@ without the poses, and are inliers of some epipolar geometry, are tested against
 
 Note [Wrong matches]
 ~~~~~~~~~~~~~~~~~~~~
-Of repeated texture, or between cameras far apart, wrong matches fit an epipolar geometry of their own, and a pair of
-right poses is contradicted by up to two thirds of its matches (`examples/throw`, cameras 29 degrees apart). So a pair
-only raises a suspicion: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which
-seldom match wrongly, are looked at first, and no others where all of them agree.
+Wrong matches of repeated texture, or between cameras far apart, fit an epipolar geometry of their own: up to two thirds
+of the matches of a pair contradict right poses (`examples/throw`, cameras 29 degrees apart). So a pair only raises a
+suspicion: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which seldom match
+wrongly, are tested first, and no others if all of these agree.
 """
 
 import logging
@@ -86,7 +86,7 @@ def readings_of(cameras: Mapping[str, Camera]) -> dict[str, dict[str, Camera]]:
 
 
 def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> list[Finding]:
-    """One finding for each mistake that explains cameras that are off, and one for each that may be."""
+    """A finding for each mistake that explains cameras, and for each camera that may be off or could not be checked."""
     suspects = verdict.suspects
     if suspects.everything:
         return [_explain_all(evidence, cameras)]
@@ -224,9 +224,10 @@ def _bad_pairs(evidence: Evidence, cameras: Mapping[str, Camera], name: str, ver
 def _share_with(
     evidence: Evidence, cameras: Mapping[str, Camera], name: str, camera: Camera, verdict: Verdict
 ) -> float:
-    """Share of what a camera should see that violates its pose when that is ``camera``; NaN without any.
+    """Share of the evidence that contradicts ``camera`` in place of camera ``name``; NaN without evidence.
 
-    Of the points that a corrected camera explains; of its matches with good cameras where there is none.
+    The evidence are the points that the corrected camera explains or, without a correction, the matches with cameras
+    that are not off.
     """
     if (found := verdict.resections.get(name)) is not None:
         return max(1 - explained(verdict.tracks, camera, name) / found.points, 0.0)
@@ -282,7 +283,7 @@ def examine_poses(
 def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     """Test the given poses of the training cameras; held-out pictures are never read.
 
-    Poses are right, or suspicious, which warnings report with the cameras, or contradicted by the pictures.
+    Suspicious cameras are reported by warnings; poses that the pictures contradict as a whole are refused.
 
     Raises:
         CalibrationError: most cameras are off, and most good matches violate the epipolar geometry of the poses.

@@ -126,11 +126,11 @@ class _Table:
 
 
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
-    """Points from the matches of cameras that are not ``off``; those of ``off`` cameras are included.
+    """Points from the matches of cameras that are not ``off``, with all observations of them, also by ``off`` cameras.
 
-    Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
-    where the rays of their keypoints pass closest, in the sense of least squares; of a point whose keypoints disagree
-    those count on which most of them agree.
+    Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. A point lies
+    where the rays of its keypoints pass closest (least squares). If its keypoints disagree, only the largest group that
+    agrees is used (:func:`_agreeing`).
     """
     names = tuple(name for name in cameras if name in evidence.keypoints)
     limit = AGREE_PIXELS * pixel_scale(max((cameras[name].width for name in names), default=0))
@@ -176,7 +176,7 @@ def _edges(
 def _components(
     first: Indices, edges: Indices, names: tuple[str, ...], evidence: Evidence
 ) -> tuple[Indices, Indices, Indices]:
-    """Point, camera and keypoint of each observation; points have one keypoint in a picture, and two pictures."""
+    """Point, camera and keypoint of each observation; a point has two or more pictures, and one keypoint in each."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

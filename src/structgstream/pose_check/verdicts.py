@@ -332,8 +332,10 @@ class Verdict:
 def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
     """Names the cameras that are off.
 
-    Pairs raise a suspicion; then points of the other cameras decide. A camera is off when another pose or focal length
-    explains these points much better than the given one, and it is not when none explains more of them.
+    Pairs raise a suspicion; then points of the other cameras decide. A camera is off if another pose or focal length
+    explains these points much better than the given one, and is not off if none explains more of them. Where points do
+    not decide, it is off if :data:`MIN_MATCHES` of its matches contradict its pose and none agrees with it; else it is
+    doubtful or, with fewer matches, unchecked.
     """
     errors = pair_errors(evidence, cameras)
     suspects = find_suspects(errors, cameras)

@@ -8,7 +8,7 @@
     VIDEOS/CAMERA/FRAME.jpg       a folder of pictures per camera, in the folder or in images/ below it
     VIDEOS/CAMERA.jpg             one picture per camera
 
-What is missing, of two cameras of one name, or cannot be read is a ``CaptureError``.
+A missing folder, two files of one camera and a file that cannot be read are a ``CaptureError``.
 """
 
 import logging
@@ -327,7 +327,7 @@ def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[fl
 def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
     """One picture of each camera without what moves: each value is the median over pictures spread over its take.
 
-    It is of no moment, so it needs no clocks; what stands longer than half of the take remains.
+    It does not belong to one moment, so it needs no clocks; what stands still for more than half of the take remains.
     """
     found = {}
     for name in footage.cameras:

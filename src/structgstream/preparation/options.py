@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The options of a preparation, and how they are written on the command line; what is none is a ``ConfigError``."""
+"""The options of a preparation, and how they are written on the command line; invalid ones are a ``ConfigError``."""
 
 import math
 import re
@@ -33,8 +33,8 @@ class PrepareOptions:
     """How a capture is made.
 
     Args:
-        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool next to the videos, else ``sfm``), or a
-            calibration file or the folder that holds one.
+        calibration: ``sfm``, ``board``, ``auto`` (``board`` with ``board_videos``, else a calibration next to the
+            videos, else ``sfm``), or a calibration file or the folder that holds one.
         lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv``, ``brown`` or ``fisheye``; None for
             ``radial`` by structure from motion and ``opencv`` by a board.
         intrinsics: ``shared`` for cameras of one make and zoom, else ``own``.

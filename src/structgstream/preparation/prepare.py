@@ -101,7 +101,7 @@ class Job:
         self._opened: FrameSource | None = None
 
     def find(self) -> Footage:
-        """The cameras; names and numbers of cameras that are not there are refused before anything takes time."""
+        """The cameras; unknown names in the options and too few cameras are refused before anything takes time."""
         self.steps.begin("find")
         options, distance = self.options, self.options.distance
         held_out = () if options.held_out == ("auto",) else options.held_out
@@ -385,8 +385,8 @@ SQUARE = 0.01
 
 
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
-    """Refuses options that have no effect, so that their user expects another capture, and those of which only a later
-    step would find that they cannot be."""
+    """Refuses options that would have no effect, since their user expects one, and what a later step would refuse after
+    minutes of work."""
     if options.fps is not None and footage.tracks:
         raise ConfigError(
             f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "

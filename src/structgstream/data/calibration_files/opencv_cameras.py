@@ -66,7 +66,7 @@ def _find(folder: Path) -> Iterator[tuple[Path, ...]]:
 
 
 def _files(folder: Path) -> tuple[Path, ...]:
-    """The files with cameras; where there is none, those that cannot be parsed."""
+    """The files with cameras, then those of OpenCV that cannot be parsed, which reading refuses."""
     try:
         files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES and file.is_file()]
     except OSError:

@@ -21,7 +21,7 @@ class Ingest:
 
     Args:
         sizes: width and height of each camera's pictures as they were calibrated, pixels.
-        fps: maximum number of sets per second.
+        fps: frames per second of the stream; faster cameras give up to 4/3 as many sets (``MIN_SPACING``).
         now: monotonic seconds.
         unix_offset: Unix time minus ``now``, seconds.
         sound: receives the sound of the camera that it names; None for none.

@@ -3,9 +3,9 @@
 
 They are those of a period's first frame and of the last frames, in ``OUT.sgs.live`` next to ``OUT.sgs``, or
 ``OUT.live`` next to the folder ``OUT``. A frame's file is complete before the frame is delivered, so at any
-interruption the frame before the first missing one is there. Frames older than :data:`LAST` are removed, so the folder
-does not grow; while no camera shows anything, the last two frames that did are retained, and those after them are
-stored as black.
+interruption the frame before the first missing one is there. Older frames are removed, so the folder does not grow
+(:meth:`ResumeCache.retain`); while no camera shows anything, the last two frames that did are retained, and those after
+them are stored as black.
 
 A file is a line of JSON, then the pictures and masks, compressed without loss, with a checksum.
 

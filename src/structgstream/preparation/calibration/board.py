@@ -238,7 +238,7 @@ PAPERS_MM: dict[Paper, tuple[float, float]] = {
     "letter": (279.4, 215.9),
     "tabloid": (431.8, 279.4),
 }
-"""Width and height, lying."""
+"""Width and height in landscape orientation."""
 
 MM_PER_INCH = 25.4
 MARGIN_MM = 6.0

@@ -47,16 +47,17 @@ def solve_board(
     camera.
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
-    share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
-    lenses share (lens_terms.py, Note [Alike lenses]). The points are the board's corners at each instant.
+    share, and all of them, with the board's pose at each instant, are then adjusted together; the last time the prior
+    that similar lenses share (lens_terms.py, Note [Alike lenses]) is estimated, too. The points are the board's corners
+    at each instant.
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
         lens: which distortion is estimated.
 
     Raises:
-        CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
-            the others; another board than given.
+        CalibrationError: a camera does not show the board well enough, or never at an instant at which another camera
+            shows it; or the pictures show another board than the given one.
     """
     pycolmap_module()
     sightings = board_sightings(pictures, board)

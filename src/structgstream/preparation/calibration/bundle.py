@@ -241,8 +241,8 @@ def adjust_together(
 ) -> SolvedCalibration:
     """``found`` with poses, points and the free terms (``lens_terms.py``) of its lenses adjusted, without the
     observations that are more than ``pixels`` off. ``lens`` has the number of the lens of each camera; cameras with
-    shared intrinsics have one. Lenses of one picture size share a mean; where ``makes`` has a number for each camera,
-    those of one number."""
+    shared intrinsics have one. Lenses of one picture size share a mean; with ``makes``, a number for each camera, those
+    of one picture size and one number."""
 
     def adjusted(found: SolvedCalibration, parameters: Parameters) -> SolvedCalibration:
         cameras = cameras_in(parameters, found.cameras, bundle.lens)

@@ -213,7 +213,7 @@ def observed(model: Any, keypoints: Mapping[str, Keypoints], names: Iterable[str
     return points, Observations(table[:, 0], table[:, 1], pixels, instants)
 
 
-SLACK_DEGREES = 0.4  # largest angle between a ray and its point, and of a match to its epipolar plane
+SLACK_DEGREES = 0.4  # largest angle between a ray and its point while points are triangulated
 ENOUGH = 1000  # observations that each camera has in a first solution that is left as it is
 MIN_VIEWS = 3  # cameras that see a point: two agree on their epipolar line by chance
 MIN_GAIN = 1.3  # ratio of the observations then to those before; with less gain the first solution stays

@@ -65,7 +65,8 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
     "brown": (60.0, 85.0, 40.0),
     "fisheye": (120.0, 150.0, 90.0, 170.0),
 }
-"""Degrees across the longer side that are tried where none is given, until one places all cameras."""
+"""Degrees across the longer side that are tried in this order, after the focal lengths that cameras state, until one
+places all cameras (:func:`_best_attempt`)."""
 
 
 def solve_structure(
@@ -89,12 +90,13 @@ def solve_structure(
             They have one lens; a rolling shutter is ignored.
 
     Returns:
-        the calibration in arbitrary units: the mean camera is the origin and the farthest is one unit away, as the
-        axes of the first camera. Cameras that see too little in common with the others are ``missing``. Points and
-        observations are those of the still cameras.
+        the calibration in arbitrary units: the axes are those of the first camera, the mean camera is the origin, and
+        the farthest one is one unit away from it. Cameras that see too little in common with the others are
+        ``missing``. Points and observations are those of the still cameras.
 
     Raises:
-        CalibrationError: pictures that do not belong together, too little in common, or no roving frame that has.
+        CalibrationError: fewer than three cameras can be placed, or no roving frame; or shared intrinsics are asked for
+            pictures of several sizes.
     """
     pycolmap_module()
     keypoints = all_keypoints(pictures)
@@ -148,7 +150,8 @@ def _best_attempt(
     *,
     stills: Collection[str],
 ) -> _Attempt:
-    """That of the largest model, of those before all still cameras and enough of the others are placed."""
+    """The attempt with the largest model; no further start is tried once one places all still cameras and enough roving
+    frames."""
     best: _Attempt | None = None
     enough = len(stills) + ENOUGH_ROVING * (len(starts[0]) - len(stills))
     for cameras in starts:
@@ -255,7 +258,7 @@ def _attempt(
     *,
     stills: Collection[str],
 ) -> _Attempt:
-    """The incremental model, or the global one if that places more still cameras."""
+    """The incremental model; if that lacks still cameras that pairs connect, the larger of it and the global one."""
     pairs = verified_pairs(keypoints, matches, cameras)
     attempt = _Attempt(None, pairs)
     if not pairs:
@@ -281,8 +284,10 @@ def _finished(
     *,
     lens: LensModel,
 ) -> SolvedCalibration:
-    """The model with all intrinsics adjusted, without outliers, in normalised coordinates; without roving frames, of
-    which each camera has matches enough, matched again."""
+    """The model with all intrinsics adjusted, without outliers, in normalised coordinates.
+
+    Without roving frames it is matched again (:func:`rematched`); with them every camera has enough matches.
+    """
     model = attempt.model
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())

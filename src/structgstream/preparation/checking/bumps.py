@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras were bumped between two frames, and which only have something in their pictures that moved.
 
-The pictures of both look alike. But cameras that stood still see a thing that moved under their poses before and after,
-and the pose of one that was bumped fails at one of the two instants.
+The pictures of one camera do not distinguish the two. But matches with other cameras do: if a thing moved, they fit the
+camera's pose at both instants; if the camera was bumped, they contradict it at one of the two.
 """
 
 from collections.abc import Mapping

@@ -126,11 +126,12 @@ def _stated_lateness(source: FrameSource) -> dict[str, float]:
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
-    """An error for cameras that are surely off by more than half a frame, a warning from a quarter of one and 5 ms on,
-    a note of those that cannot be judged.
+    """An error for a camera that is off by more than 0.6 frames and, less two standard errors, by more than half a
+    frame; a warning for one that is off by more than a quarter of a frame, 5 ms and three standard errors, and for one
+    in whose pictures nothing changes; a note of those that cannot be judged.
 
-    Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
-    between those of the others get one warning.
+    A camera is off if its pictures show another instant than its time stamps state. Cameras whose pictures, by their
+    time stamps, lie between those of the others get one warning together.
     """
     if measured is None:
         return []

@@ -47,7 +47,7 @@ class Lag:
 
     seconds: float  # time in the second signal minus time in the first
     sigma_seconds: float
-    """Standard error, from the peaks without each group of channels; half a step with a single channel."""
+    """Standard error, from the peaks without each group of channels; half a step with fewer than three channels."""
     peak: float  # correlation there, at most 1
     judged: float  # correlation times the square root of the overlap's share of the longest one
     rival: float  # largest such value outside the peak

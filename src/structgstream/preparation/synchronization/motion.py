@@ -57,7 +57,7 @@ class Changes:
 
     @property
     def activity(self) -> Floats:
-        """``[T - 1, 1]``: sum over the picture of the square roots of changes."""
+        """``[T - 1, 1]``: mean over the picture of the square roots of changes."""
         return np.sqrt(self.amounts, dtype=np.float32).mean((1, 2), dtype=np.float64)[:, None]
 
     @property
@@ -398,7 +398,7 @@ def _unconnected(others: Sequence[str], group: Sequence[str], seconds: float) ->
     names = ", ".join(repr(name) for name in others)
     rest = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
-        f"What moves before {names} cannot be recognised in the motion before {rest}, so their clocks are not "
+        f"The motion in the pictures of {names} is not found again in those of {rest}, so their clocks are not "
         f"connected. The beginnings of the takes were compared, {seconds:.1f} s of the shortest: film ten seconds of "
         "motion there that all see (a person who walks and claps), give the calibration, or synchronise by audio or "
         "timestamps.csv."

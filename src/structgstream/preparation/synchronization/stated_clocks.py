@@ -119,8 +119,8 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats, *, 
             rate = 1.0
     if abs(rate - 1) > MAX_DRIFT:
         raise CaptureError(
-            f"By {file} the clock of camera {name!r} runs {rate:.4g} times as fast as its video; frames lack in the "
-            "video or in the numbers of frames, or the rate of the video is wrong."
+            f"By {file} the clock of camera {name!r} runs {rate:.4g} times as fast as its video; frames are missing "
+            "from the video or from the frame numbers, or the rate of the video is wrong."
         )
     offset = float(np.mean(seconds - rate * own))
     off = seconds - offset - rate * own
@@ -128,8 +128,8 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats, *, 
     if abs(off[worst]) > MAX_DEVIATION * period:
         raise CaptureError(
             f"By {file} frame {frames[worst]} of camera {name!r} is {abs(off[worst]):.4f} s off a steady clock, "
-            f"more than half a frame period ({period / 2:.4f} s); frames lack in the video, or numbers in the table "
-            "are wrong."
+            f"more than half a frame period ({period / 2:.4f} s); frames are missing from the video, or numbers in "
+            "the table are wrong."
         )
     return StatedClock(Clock(offset, rate), float(np.std(off)), "table")
 

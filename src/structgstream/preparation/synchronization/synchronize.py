@@ -44,8 +44,8 @@ class Synchronization:
     """The clocks of all cameras."""
 
     clocks: Mapping[str, Clock]
-    """Camera to its clock, from the camera's stamps to common time: that of the first camera, or the one that stamps
-    are of."""
+    """Camera to its clock, from the camera's stamps to common time: the time of the first camera, or of the clock that
+    a table or the files state."""
     uncertainty_seconds: Mapping[str, float]
     """Camera to the standard error of its common times, relative to the mean of all cameras."""
     method: str  # how they were found: ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
