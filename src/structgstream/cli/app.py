@@ -253,8 +253,8 @@ class StopSignal:
             signal.signal(self._number, self._before)
 
     def end(self, *, whole: bool) -> None:
-        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway. Raises
-        Terminated or KeyboardInterrupt if it was."""
+        """Must be called between frames. Raises Terminated or KeyboardInterrupt, which ends the block, if a signal has
+        come and the run is not ``whole``, that is, complete."""
         if self.asked and not whole:
             raise Terminated if self._number == signal.SIGTERM else KeyboardInterrupt
 
@@ -271,10 +271,11 @@ class StopSignal:
 def interruptible(*, again_seconds: float = 3.0) -> Iterator[None]:
     """Within this block Ctrl-C is a ``KeyboardInterrupt`` that leaves it.
 
-    Libraries lose it: one that is loaded at the moment makes an error of its own of it (pycolmap does), a callback from
-    C drops it. So an error after Ctrl-C counts as Ctrl-C, and a block that goes on is interrupted again. Only for work
-    whose results are there whole or not at all, as what cleans up is interrupted again, too. Outside of the main
-    thread, and where Ctrl-C is ignored (``nohup``), the block changes nothing.
+    Libraries can lose the exception: one that is being imported converts it to its own error (pycolmap does), and a
+    callback from C drops it. So any error after Ctrl-C counts as Ctrl-C, and a block that continues is interrupted
+    again every ``again_seconds``. Cleanup code is interrupted again, too, so use it only for work whose results are
+    written completely or not at all. Outside of the main thread, and where Ctrl-C is ignored (``nohup``), the block
+    changes nothing.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):

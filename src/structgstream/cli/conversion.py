@@ -291,9 +291,9 @@ class AddSound:
     output: StreamOutput
     """The stream file to write."""
     sound: Annotated[str, tyro.conf.arg(metavar="CAMERA|FILE|auto")] = "auto"
-    """As of reconstruct: the sound of a camera, of a file, or of the best microphone."""
+    """As in reconstruct: the sound of a camera, of a file, or of the best microphone."""
     sound_offset: Annotated[float | None, shown_as("SECONDS")] = None
-    """As of reconstruct: when the file begins, in seconds after the first frame of the capture."""
+    """As in reconstruct: when the file begins, in seconds after the first frame of the capture."""
     overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
 

@@ -63,8 +63,8 @@ class Track:
     """Begin at the end of this finished segment, with its fitted positions, which are more exact than tracked ones: for
     the groups after it."""
     cameras: Number = None
-    """Largest number of cameras for a frame; of more, every second or third is used, in turn. Default: half of the
-    rig, from 6 to 14."""
+    """Largest number of cameras for a frame; of more, every second, third, ... is used, in turn. Default: half of the
+    rig, at most 14; all of a rig of 10 or fewer."""
     device: Device = "auto"
     """Compute back-end."""
     overwrite: Flag = False
@@ -196,8 +196,8 @@ def fit_group(arguments: list[str]) -> None:
 class Join:
     """Joins groups of frames that were fitted separately to one stream (docs/cluster.md).
 
-    Every checksum is verified, and that the segments have one header and every frame once. Static content is blended
-    at the border of two groups, so that it does not flicker there.
+    Verifies every checksum, and that all segments have the same header and contain every frame exactly once. Static
+    content is blended at the border of two groups, so that it does not flicker there.
 
     Example: structgstream join groups/*.sgs -o ball.sgs
     """
@@ -238,7 +238,7 @@ def join(arguments: list[str]) -> None:
         print_lines(
             console,
             f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "
-            f"{border.withdrawn:,} do not, as two fits side by side would show there.",
+            f"{border.withdrawn:,} do not, because a mixture of the two fits would be visible there.",
         )
 
     frames = join_segments(

@@ -67,8 +67,8 @@ class Inspect:
     plot: Annotated[Path | None, shown_as("PATH.png")] = None
     """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
-    """Write everything to this file, with the keys "header" and "packets"; - is standard
-    output."""
+    """Write everything to this file; - is standard output. Keys of a stream: "header" and "packets"; of a capture:
+    "layout", "fps", "frames", "held_out", "points", "cameras" and "remarks"."""
     all_packets: Flag = False
     """List every packet. Default: evenly spaced packets of a long stream."""
     config: Flag = False
@@ -323,7 +323,8 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
-    """The capture at ``path`` as plain values: ``layout``, ``fps``, ``frames``, ``held_out``, ``cameras``, ``remarks``.
+    """The capture at ``path`` as plain values: ``layout``, ``fps``, ``frames``, ``held_out``, ``points``, ``cameras``
+    and ``remarks``.
 
     ``remarks`` are the warnings of its reader: what is left out, and why. A folder without calibration is described as
     the footage that ``prepare`` would read.

@@ -305,7 +305,8 @@ class SegmentOptions:
     ) -> Iterator["Storage[Scene] | None"]:
         """Where the stream goes, checked before anything takes time; None for the file ``output``.
 
-        The end of the block waits until everything is published; ``report`` gets a sentence if that fails.
+        The end of the block waits up to :data:`FINISH_SECONDS` until everything is published; ``report`` gets a
+        sentence if files remain.
         """
         from structgstream.recorder import check_output, segments_at, segments_folder
 

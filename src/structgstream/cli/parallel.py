@@ -54,7 +54,7 @@ class WorkerOptions:
     workers: Number = None
     """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
     threads: Number = None
-    """Threads of each. Default: its share of the cores; one on a cluster."""
+    """Threads of each. Default: its share of the cores; one on a cluster that is joined."""
     track_threads: Number = None
     """Threads of the tracking pass, for which all groups wait; fewer groups run meanwhile if these are more than a
     worker's. Default: as a worker."""
@@ -254,7 +254,8 @@ SHOWN = 8
 
 
 def cells(states: Sequence["State"], *, width: int) -> Text:
-    """A sign per group; of many groups, one for several, which shows the least advanced state."""
+    """A sign per group; of many groups, one for several, which shows the first of their states in
+    :data:`WORST_FIRST`."""
     share = max(1, -(-len(states) // (width * ROWS)))
     text = Text()
     for place, start in enumerate(range(0, len(states), share), 1):
@@ -354,7 +355,7 @@ class Plan:
     workers: int = 1
     """Workers that run side by side on each machine; each is taken to be as fast as the measured one alone."""
     finish_hours: Annotated[float | None, shown_as("H")] = None
-    """Say how many workers end within H hours."""
+    """Also print how many workers are needed to finish within H hours."""
     groups: Number = None
     """Frames of a group. Default: one key interval."""
     length: Annotated[int | None, shown_as("FRAMES")] = None

@@ -45,9 +45,11 @@ class Render:
     scene: Annotated[tyro.conf.Positional[Path | None], shown_as("[FOLDER]")] = None
     """The capture, for --compare."""
     output: Annotated[Path | None, shown_as("OUT", "-o")] = None
-    """Output file or folder. Default: a video next to the stream, named after the camera or the path."""
+    """Output file or folder. Default: next to the stream, named after the camera or the path: a video, or a PNG with
+    --frame and no --path."""
     camera: Annotated[str | None, shown_as("CAMERA")] = None
-    """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
+    """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one; for an orbit, and
+    without a held-out one, the one nearest to the middle of the rig."""
     path: Annotated[Literal["orbit", "arc"] | None, shown_as()] = None
     """Camera path: an orbit around one camera, or an arc from one camera to another."""
     between: Annotated[tuple[str, str] | None, shown_as("CAMERA CAMERA")] = None
@@ -182,13 +184,14 @@ def path_pictures(
 
 
 def path_length(reader: "StreamReader", seconds: float | None) -> int:
-    """The views of a camera path of this duration, at the stream's rate; None: the stream's, or a little longer."""
+    """The number of views of a camera path of this duration, at the stream's rate; None: the stream's own duration, at
+    least :data:`MIN_PATH_SECONDS`."""
     length = max(_seconds(reader, *reader.runs), MIN_PATH_SECONDS) if seconds is None else seconds
     return max(round(length * reader.header.fps), 1)
 
 
 def is_in_step(reader: "StreamReader", count: int) -> bool:
-    """Whether the stream lasts as long as a path of ``count`` views, which then shows it at its speed."""
+    """Whether the stream lasts at least as long as a path of ``count`` views, which then shows it at normal speed."""
     return round(_seconds(reader, *reader.runs) * reader.header.fps) >= count
 
 

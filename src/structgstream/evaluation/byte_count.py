@@ -61,8 +61,8 @@ def packet_rows(reader: StreamReader) -> list[Row]:
 
 
 def shown_seconds(frames: Sequence[PacketInfo | Row], fps: float) -> float:
-    """How long a stream of ``fps`` shows these frames, seconds: from the time of the first to that of the last, which
-    is farther where a live run left frames out between, and the distance of two frames; 0 without any."""
+    """Seconds for which a stream of ``fps`` shows these frames: the difference of the last and the first presentation
+    time, which includes frames that a live run left out, plus one frame interval; 0 without frames."""
     return frames[-1].pts_seconds - frames[0].pts_seconds + 1.0 / fps if frames else 0.0
 
 
@@ -117,9 +117,9 @@ LABELLED_SHARE = 0.06  # smaller shares of a part are not labelled
 
 
 def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
-    """Bars over the frames, at least one, stacked by field, above the composition of each part of the stream, the last
-    of which determine the order of the fields. Raises MissingExtraError without matplotlib, StorageError if the picture
-    cannot be written."""
+    """Draws a bar for each frame (at least one), stacked by field, and below them the composition of each of ``parts``.
+    Fields have the order of :func:`field_colors`, which begins with the last part. Raises MissingExtraError without
+    matplotlib, StorageError if the picture cannot be written."""
     colours = field_colors(parts)
     across = 0.34 * len(parts) + 0.3
     figure = figure_of(10.0, 4.4 + across)

@@ -58,8 +58,8 @@ from structgstream.scene.render import Drawable, render_picture
 from structgstream.session.frame_report import counts
 
 STORED_FRAMES, STORED_SHARE = 5, 4
-"""At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the
-pixels."""
+"""At most five frames, and at most one in four but at least one, are scored at the stored size: twice the size has four
+times the pixels."""
 
 
 def halved(camera: Camera) -> Camera:
@@ -109,7 +109,7 @@ class Compared:
     picture: Picture  # [H, W, 3] rendering, black in masked pixels
     scores: Scores  # scores of the rendering
     first: Picture  # the camera's first picture
-    counting: Mask | None  # [H, W], the pixels that count in both; None for all
+    counting: Mask | None  # [H, W], the pixels that count in this picture and in first; None for all
     ghosts: Ghosts | None  # ghosts of the rendering (ghosts.py); None if the camera's background is not known
 
 

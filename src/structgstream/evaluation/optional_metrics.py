@@ -51,7 +51,7 @@ def flicker(now: Picture, before: Picture, still: Mask) -> float | None:
 
 
 MetricSelection = Literal["all", "basic"]
-"""All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
+"""All metrics, or only the cheap ones: PSNR and its variants, SSIM, and ghosts."""
 
 OF_WHOLE_PICTURES = ("ms_ssim", "lpips_alex", "lpips_vgg", "temporal_flip", "t_lpips")
 TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
@@ -117,8 +117,8 @@ def optional_scores(
 ) -> tuple[dict[str, float | None], ComparedFrame]:
     """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
 
-    FLIP, flicker and the warping error are computed over the pixels of ``mask``. MS-SSIM, LPIPS and the differences of
-    changes compare whole pictures, so they are None with a mask.
+    FLIP, flicker and the warping error are computed over the pixels of ``mask``. MS-SSIM, LPIPS, temporal FLIP and
+    tLPIPS compare whole pictures, so they are None with a mask.
 
     Args:
         before: the same camera's previous frame; None for the first.

@@ -32,7 +32,9 @@ class RayEngine:
 
     Args:
         address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None starts one on this
-            machine, for this process only, with ``workers``.
+            machine, for this process only.
+        workers: number of tasks at a time on a cluster that is started here; an existing cluster has its own number.
+        cores: number of threads of each task.
 
     Raises:
         MissingExtraError: Ray is not installed.

@@ -196,7 +196,7 @@ def tail_of(file: BinaryIO, begin: int) -> str:
 
 
 class LocalEngine:
-    """Processes in slots: shares of the cores, or GPUs (``task.allocate_slots``)."""
+    """Processes in slots: shares of the cores, or GPUs (:func:`allocate_slots`)."""
 
     def __init__(self, slots: Sequence[WorkerSlot]) -> None:
         self._free = list(slots)
@@ -288,7 +288,7 @@ class TaskQueue:
 
     @property
     def waiting(self) -> Sequence[str]:
-        """Names of the tasks that have not started."""
+        """Names of the tasks that wait to be started, or to be restarted after they were killed."""
         return tuple(self._ready)
 
     def submit(self, task: Task, *, gpus: int = 0) -> None:
@@ -347,7 +347,7 @@ class ExecutorOptions:
     name: ExecutorName = "local"  # local: processes of this machine; ray: a Ray cluster
     # number of concurrent tasks; None for one per GPU, or one per core. An existing cluster has its own number.
     workers: int | None = None
-    threads: int | None = None  # threads of each worker; None for its share of the cores, and 1 on a cluster
+    threads: int | None = None  # threads of each worker; None for its share of the cores, and 1 on an existing cluster
     address: str | None = None  # address of the Ray cluster; None starts one on this machine
 
 

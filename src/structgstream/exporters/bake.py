@@ -36,7 +36,7 @@ class BakedGaussians:
     """``N`` Gaussians whose colour depends on the view direction."""
 
     means: Tensor  # [N, 3]
-    quats: Tensor  # [N, 4] wxyz, unit length, w not negative
+    quats: Tensor  # [N, 4] wxyz, unit length; baked ones have w >= 0, those of a read .ply any sign
     scales: Tensor  # [N, 3] standard deviations, in the unit of means
     opacities: Tensor  # [N] in (0, 1)
     sh: Tensor  # [N, (degree + 1)^2, 3] sRGB coefficients (harmonics.py)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formats of web viewers: ``.splat``, ``.spz`` and ``.sog``.
+"""Formats of web viewers: ``.splat``, ``.spz``, ``.sog``, and glTF's ``.glb`` with ``KHR_gaussian_splatting``.
 
 ``.splat`` has 32 bytes per Gaussian without a header, the most important ones first: float32 position and scales (not
 logarithms), 8-bit red, green, blue and opacity, and an 8-bit quaternion wxyz with the components ``(byte - 128) /

@@ -56,7 +56,7 @@ class GroupBase:
     @cached_property
     def config(self) -> StreamConfig:
         """The configuration of the stream, which is that of every group. Raises ConfigError if it cannot be read, has
-        periods or sound, or was made without scene flow, which groups need."""
+        periods, sound or another codec than ``compact``, or was made without scene flow, which groups need."""
         config = from_json(self.header.config)
         check_for_groups(config, name=self.name)
         if self.header.sound is not None:

@@ -60,9 +60,9 @@ def relocate_lost_anchors(
     rules: SpawnRules,
     backend: Backend,
 ) -> tuple[Scene, int]:
-    """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors; ``first`` are its
-    anchors in frame 0, in the same order. Views without up-to-date renderings in ``active_tiles`` are skipped. Raises
-    MissingExtraError without SciPy."""
+    """``dynamic`` with its lost anchors displaced as their neighbours, and the number of moved anchors; ``first`` are
+    its anchors in frame 0, in the same order. Views without up-to-date renderings in ``active_tiles`` are skipped.
+    Raises MissingExtraError without SciPy."""
     pixel = pixel_size(first.positions, [view.camera for view in views])
     if pixel is None or len(first) < 2:
         return dynamic, 0
@@ -266,7 +266,7 @@ class _Rounds:
         return DynamicSplit.of(current, replace(found, anchors=found.anchors | away, free=torch.ones_like(found.free)))
 
     def _relocated(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
-        """``split`` with its lost anchors moved to their neighbours, and the number of lost anchors."""
+        """``split`` with its lost anchors displaced as their neighbours, and the number of moved anchors."""
         fit, config = self.fit, self.fit.config
         dynamic, count = relocate_lost_anchors(
             split.dynamic,

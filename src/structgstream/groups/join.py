@@ -26,7 +26,8 @@ from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.training.online.patching import IDS_PER_FRAME
 
 MAX_GROUPS = 8
-"""Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
+"""Number of groups after which a run ends, or more if the last of them has fewer than :data:`OWN_FRAMES` frames: a
+process takes two seconds to start, and reports its result only when it ends."""
 POLL_SECONDS = 0.2
 OnBorder = Callable[[Border], None]
 

@@ -62,6 +62,7 @@ class SeamBlend:
 
     Args:
         before: the decoded last frame of the group before, itself blended.
+        first: the decoded first frame of the group.
         moving: mask ``[M]`` of the anchors that move at the border.
         steps: quantization steps by field; a field without one is not blended.
     """
@@ -156,12 +157,13 @@ def _bins(values: Tensor, step: float) -> Tensor:
 
 
 CAMERAS = 9
-"""Training cameras, at equal distances in the rig, for which the frames around a border are drawn."""
+"""Least number of training cameras, at equal distances in the rig, for which the frames around a border are drawn, or
+all of a smaller rig. Fewer than twice as many are drawn."""
 
 
 @dataclass(frozen=True)
 class BorderPictures:
-    """Renderings of the two frames at a border; at 640 x 360 they take 50 MB."""
+    """Renderings of the two frames at a border; of nine cameras at 640 x 360 they take 50 MB."""
 
     before: Mapping[str, Tensor]  # rendering [H, W, 3] of the last frame of the group before, by camera
     first: Mapping[str, Tensor]  # rendering [H, W, 3] of the first frame of the group, by camera

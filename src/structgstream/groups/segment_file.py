@@ -270,7 +270,8 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
 
     Raises:
         ConfigError: the existing file was fitted from something else, or is a stream.
-        StorageError: a file cannot be renamed, or another process writes it.
+        StorageError: an unfinished file with all frames cannot be renamed, or another process writes it.
+        OSError: a damaged finished file cannot be renamed.
     """
     if path.exists():
         found = _matching(path, base, identity)

@@ -263,8 +263,8 @@ def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list
     """Groups of about ``length`` frames that begin at frames with little motion.
 
     Every group has at least half and at most one and a half times ``length`` frames; the last may be shorter, but has
-    at least two. Among all such divisions, this one minimizes the sum over the borders of ``changed``, the share of
-    changed pixels by frame at which a group may begin, relative to their number.
+    at least two. ``changed`` is the share of changed pixels by frame at which a group may begin. Among all such
+    divisions, this one minimizes the sum over its borders of the share there plus the mean of all shares.
     """
     least, most = (length + 1) // 2, length + length // 2
     mean = sum(changed.values()) / max(len(changed), 1)

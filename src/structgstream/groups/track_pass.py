@@ -67,10 +67,11 @@ def track_capture(
 ) -> Generator[TrackProgress, None, None]:
     """Tracks through ``source`` into the file ``path``; resumes an interrupted pass.
 
-    The generator yields after each frame. A complete track yields nothing; it is renamed if the pass was killed just
-    before it did so.
+    The generator yields after each frame, and nothing for a complete track, whose file is renamed if an earlier pass
+    was killed just before it renamed it.
 
     Raises:
+        StreamError: ``path`` is an existing file, but no track.
         ConfigError: ``path`` is a track of another header, capture or configuration, or no frame is after the group
             ``options.after``.
         StorageError: it cannot be written.

@@ -40,7 +40,7 @@ from structgstream.training.residuals import apply_camera_color
 from structgstream.training.views import View, area_mean, blackened, training_views
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
-"""A frame uses half of a rig's cameras if that number is within these bounds."""
+"""A frame uses half of a rig's cameras, or all if half were fewer than the first number; never more than the second."""
 PRIOR = 0.7
 """Initial displacement of a primitive, as a share of its last displacement."""
 RENDERED_EVERY = 3
@@ -52,8 +52,8 @@ class TrackConfig:
     """Tracking; not in the paper."""
 
     cameras: int | None = None
-    """Approximate upper bound of the cameras used in a frame. Of a larger rig every second or third camera is used, in
-    turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MAX_CAMERAS`)."""
+    """Upper bound of the cameras used in a frame, at least 2. Of a larger rig every second, third, ... camera is used,
+    in turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MAX_CAMERAS`)."""
     picture_scale: float = 0.25
     """Scale at which coverage is computed, relative to the pictures of the stream."""
 

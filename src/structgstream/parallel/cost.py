@@ -145,7 +145,8 @@ def measured_in(folder: Path) -> Measured:
     pass and of joining, too.
 
     Raises:
-        ConfigError: there is no finished run, or none with a group that begins after frame 0.
+        ConfigError: there is no finished run, or no group of two or more frames that begins after frame 0 and was
+            fitted in one attempt.
     """
     parts = Parts(folder)
     groups = [(parts.completed.get(group_name(a, b)), a, b) for a, b in read_groups(parts.track) or ()]

@@ -135,6 +135,7 @@ def drive(
         exchange: how parts are transferred; by default all machines see the folder.
 
     Raises:
+        ConfigError: the folder has parts of another plan.
         TaskError: tasks failed; complete parts remain.
         StorageError: the parts cannot be written, or are not seen here.
     """

@@ -38,7 +38,7 @@ LONGEST_DELAY_SECONDS = 10.0
 
 
 class ObjectFolder:
-    """The objects of a URL, in the syntax of fsspec, by name, with the bytes of the files that they are copies of.
+    """The objects below ``url`` (in fsspec's syntax), by name; each is a copy of a file.
 
     Addresses and credentials come from the environment, as the scheme's package reads them (``AWS_ENDPOINT_URL``,
     ``AWS_ACCESS_KEY_ID``, ...). A request that fails is made again, :data:`TRIES` times in all, with growing, varied

@@ -4,9 +4,9 @@
 Note [What is served]
 ~~~~~~~~~~~~~~~~~~~~~
 Addresses consist of plain names, and each name is looked up. Only streams of the folder are served, and of these only
-the files that a sink writes, previews and the metrics of the run. With keys every address except ``/health`` and
-``/player.js`` needs a token. The token is checked before the stream is looked up, so that responses do not reveal which
-streams exist.
+the files that a sink writes, previews and the metrics of the run. With keys every address needs a token except
+``/health``, ``/player.js`` and ``/streams/NAME`` without a slash at its end, which redirects for any name. The token is
+checked before the stream is looked up, so that responses do not reveal which streams exist.
 
 docs/serve.md lists the addresses. The reverse proxy in front bounds connections, rates and slow clients.
 """

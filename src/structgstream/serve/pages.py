@@ -36,7 +36,8 @@ from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, 
 from structgstream.errors import PlayerError, StorageError, StreamError
 
 MAX_PAGE_STREAM_BYTES: Final = 256 * 10**6
-"""Largest stream in a page: browsers do not support a string of twice this length."""
+"""Largest stream in a page, which holds it as base64, a third longer: browsers limit the length of a string, Chrome to
+2^29 - 24 characters."""
 
 _POLICY: Final = {
     "default-src": "'none'",

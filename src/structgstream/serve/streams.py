@@ -140,9 +140,9 @@ class ServedStream:
 class Catalog:
     """The streams of a folder, listed again when the last listing is a second old.
 
-    A folder of segments, or of renditions, is one stream: itself. A stream of another name than Note [Plain names] says
-    is left out, with a warning. Raises PlayerError if it is no folder, cannot be read, or is itself a stream of such a
-    name.
+    A folder that itself holds segments or renditions is the only stream. A stream whose name is not plain (Note [Plain
+    names]) is left out, with a warning. Raises PlayerError if ``folder`` is not a folder, cannot be read, or is itself
+    a stream whose name is not plain.
     """
 
     def __init__(self, folder: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
