@@ -125,7 +125,8 @@ def reconstruct(
         capture: the folder of a capture, or an opened one, such as a ``LiveSource``, which is read until it ends.
         path: the stream file to write; the folder, if it is written as segments.
         preset: name of a preset, or a configuration (``dataclasses.replace`` on one of ``PRESETS``).
-        quality: for compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
+        quality: for compact streams, -6 to 6: quantization steps are multiplied by 2^-quality, those of frame 0 and of
+            the MLPs by 2^(-quality / 2).
         mbits: for compact streams, target rate in Mbit/s; None for constant quality.
         seed: random seed; None for the preset's.
         held_out: names of the cameras to exclude from training; None for those that the capture's layout holds out;

@@ -145,7 +145,7 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
 
 @contextmanager
 def renamed_on_success(path: Path) -> Iterator[Path]:
-    """The partial file to which the block writes what gets the name ``path`` at its end, unless it raises.
+    """The path of a partial file for the block to write; it is renamed to ``path`` at the end, unless the block raises.
 
     For writers that open and lock their file themselves. Raises StorageError if the file cannot be renamed.
     """

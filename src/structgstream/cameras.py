@@ -228,7 +228,8 @@ class Similarity:
 
 MAX_SKEW_PIXELS = 0.5
 ONE_PLACE = 1e-12
-"""Distance of cameras, as a share of theirs to the origin, up to which it is what rounding leaves."""
+"""Cameras are at one place if they are nearer to each other than this share of their distance to the origin, which
+rounding errors alone can cause."""
 
 
 def skew_pixels(camera: Camera) -> float:
@@ -284,7 +285,8 @@ def check_rig(rig: CameraRig) -> None:
 
 
 NEAR_IN_RIG_RADII = 0.12
-"""Of the near plane by default. Cameras of a dome stand in the wall that the others see: it must not be drawn."""
+"""Default distance of the near plane, in rig radii. In a dome each camera stands in the wall that the others see, and
+what is close to a camera must not be drawn."""
 
 
 def rig_radius(rig: CameraRig) -> float:

@@ -47,8 +47,8 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
 
     Args:
         extra: the extra of this package that a user should install when OpenCV is missing.
-        refined: OpenCV's preset "medium". False: preset "fast", stopped at half resolution and without variational
-            refinement; it takes two fifths of the time and is as accurate at consistent pixels
+        refined: OpenCV's preset "medium". False: preset "fast" down to ``finest_level``, without variational
+            refinement; at half resolution it takes two fifths of the time and is as accurate at consistent pixels
             (:func:`consistency_mask`).
         finest_level: finest level of the pyramid, if not refined: 1 is half resolution, 0 full.
 

@@ -24,7 +24,7 @@ class Gaussians:
         means: ``[N, 3]`` in scene units.
         quats: ``[N, 4]`` wxyz, not necessarily unit length.
         scales: ``[N, 3]`` standard deviations in scene units.
-        opacities: ``[N]`` in (0, 1).
+        opacities: ``[N]`` in [0, 1); those of 0 are not drawn.
         colors: ``[N, 3]`` sRGB.
         ids: ``[N]`` int64, identifies a Gaussian of the scene. See Note [Ids].
         sampling_intervals: ``[N]`` side of a training pixel at the Gaussian, scene units, without gradient, which sets

@@ -60,7 +60,7 @@ class Quality:
     """One of the qualities."""
 
     name: str  # name of its folder
-    fineness: float  # online.rounding.quality: 0 is the preset's own, 1 halves every quantization step
+    fineness: float  # online.rounding.quality: 0 is the preset's own, 1 halves most quantization steps
 
 
 def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
@@ -228,7 +228,8 @@ FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "ancho
 
 
 def joint_report(reports: Mapping[str, FrameReport]) -> FrameReport:
-    """The sums of bytes and seconds; all other values are those of the finest quality, the last."""
+    """Bytes and seconds summed over the qualities, without ``field_bytes`` and ``train_psnr``; all other values are
+    those of the last of ``reports``."""
     each = [*reports.values()]
     stages = dict.fromkeys(name for report in each for name in report.seconds)
     return replace(

@@ -51,7 +51,8 @@ MIN_SCALE = 1e-12
 """Least standard deviation along an axis; files have flat Gaussians of 0."""
 KEY_INTERVAL_SECONDS = 1.0
 MAX_LINKED_SHARE = 0.1
-"""Rows are the same Gaussians if the median one moves by less than this share of the distance to any other."""
+"""Rows of two files are the same Gaussians if their median motion is less than this share of the median distance of
+two different Gaussians."""
 RING_CAMERAS, RING_DISTANCE, RING_ELEVATION_DEGREES = 8, 3.0, 15.0
 RING_SIZE, RING_FOCAL_PIXELS = (1280, 720), 1100.0
 _FRAME_BITS = 32

@@ -38,7 +38,7 @@ class StreamHeader:
         fps: frames per second.
         codec: coding of the fields: ``raw`` or ``compact``.
         dynamic: the fields that packets carry; all others are in ``static``.
-        static: the fields that are constant over the stream, exactly as the decoder uses them.
+        static: the fields that are constant over the period of this header, exactly as the decoder uses them.
         distance_input: whether the distance to the camera is an input of the MLPs.
         config: the resolved configuration of the run, as plain JSON values.
         metadata: capture name, creator, start frame and the like, as plain JSON values.

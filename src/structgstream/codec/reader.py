@@ -249,11 +249,8 @@ class StreamReader:
             yield self.packets.packet(number)
 
     def sound(self, index: int) -> FrameSound | None:
-        """The sound that is stored with one frame; None if there is none, or it or the frame is damaged.
-
-        Raises:
-            StreamError: its record is whole and violates the format.
-        """
+        """The sound that is stored with one frame; None if there is none, if it or the frame is damaged, or, with a
+        warning in the log, if its record does not follow the format."""
         return self.packets.sound(index) if self._is_whole(index) else None
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:

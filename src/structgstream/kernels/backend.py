@@ -156,11 +156,11 @@ def processor_backend() -> Backend:
 
 
 def cuda_backend() -> Backend:
-    """An NVIDIA GPU: this package's kernels, compiled on first use, and torch for the rest.
+    """An NVIDIA GPU: this package's kernels, from the wheel or compiled on first use, and torch for the rest.
 
     Raises:
-        BackendError: there is no GPU or no compiler, the kernels do not compile, or they draw otherwise than the
-            processor does.
+        BackendError: there is no GPU, there are neither kernels for it nor a compiler, the kernels do not compile or
+            load, or their pictures differ from those of the CPU.
     """
     from structgstream.kernels import cuda, cuda_fit, cuda_library
     from structgstream.kernels.self_check import disagreement
@@ -188,7 +188,7 @@ def cuda_backend() -> Backend:
 
 
 def kernel_functions(library: KernelLibrary) -> dict[str, Callable[..., Any]]:
-    """The functions of the cuda back-end that do not run in torch's own operations, or on the processor."""
+    """The cuda back-end's own functions: those of the kernels, and ``adam_step``, which is torch's fused kernel."""
     from structgstream.kernels import cuda, cuda_anchors, cuda_picture
 
     functions = functions_of(cuda_picture, cuda_anchors, cuda)
@@ -197,14 +197,14 @@ def kernel_functions(library: KernelLibrary) -> dict[str, Callable[..., Any]]:
 
 
 def on_processor(*tensors: Tensor) -> list[Tensor]:
-    """Copies on the processor, for all of which the host waits once; a tensor that lies there stays what it is."""
+    """Copies of ``tensors`` on the CPU, with one synchronisation for all; tensors already there are not copied."""
     copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
     wait_for(tensors[0].device)
     return copies
 
 
 def wait_for(device: torch.device) -> None:
-    """Until ``device`` has done all that was queued."""
+    """Waits until ``device`` has finished everything that was queued."""
     if device.type == "cuda":
         torch.cuda.current_stream(device).synchronize()
 

@@ -3,10 +3,9 @@
 
 Note [Shapes without waiting]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-The numbers of anchors in view and of Gaussians with positive opacity are known only on the GPU, and the host would have
-to synchronise to gather these rows. So all ``M * K`` Gaussians are generated. Those that are not drawn have opacity 0
-and scale 0: every rasteriser skips them, they add nothing to the volume, and no gradient passes through them. The
-number of drawn Gaussians is the count of ``opacities > 0``.
+The numbers of anchors in view and of Gaussians with positive opacity are known only on the GPU, and the host has to
+synchronise to gather these rows. :func:`generate_structured` does; :func:`generate_views` returns all ``M * K + F``
+Gaussians of each view instead. Those that are not drawn have opacity 0 and scale 0, and every rasteriser skips them.
 """
 
 from collections.abc import Sequence

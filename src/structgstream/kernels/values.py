@@ -142,8 +142,7 @@ class StructuredGaussians:
     """The Gaussians of the anchors in a camera's view.
 
     Args:
-        gaussians: ascending by id, with unit quaternions. Rows of opacity 0 have scale 0 and are invisible; only
-            back-ends with shapes that do not depend on data return such rows.
+        gaussians: those of positive opacity, ascending by id, with unit quaternions.
         anchors: ``[m]`` int64, ascending: the anchors that were evaluated, a superset of the visible ones.
         raw_opacities: ``[m, K]`` tanh outputs of these anchors, without a graph; positive ones are drawn.
     """
@@ -320,7 +319,8 @@ class FitPlan(NamedTuple):
         errors_from: the first one whose squared error is computed.
         betas: of Adam.
         eps: of Adam.
-        terms: ``[I, 5]`` results: L1, 1 - SSIM, volume, smoothness and the weighted sum of all.
+        terms: ``[I, 5]`` results: L1, 1 - SSIM, volume, smoothness, and the loss: their weighted sum plus the rate
+            term.
         squared_errors: ``[I]`` float64 results: mean squared error of the view's picture in its ``tiles``.
     """
 

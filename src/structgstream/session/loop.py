@@ -57,7 +57,7 @@ class Session(Generic[State, Memory]):
         backend: the compute back-end.
         resumed: a reader of the sink's existing frames, to continue after them; None for a new stream.
         metadata: plain JSON values for the header; must be equal in all runs of a stream.
-        on_step: called after every optimisation step.
+        on_step: called after every optimisation step; on a GPU and in native iterations after every tenth.
 
     Raises:
         CalibrationError: the pictures of a camera are larger than a stream allows, or it cannot be drawn as calibrated.
@@ -263,7 +263,7 @@ class Session(Generic[State, Memory]):
         self._shown.extend(shown)
 
     def _keep(self, index: int) -> None:
-        """Ask for the pictures that a run reads again which is resumed after this frame."""
+        """Ask the source to keep the pictures that a run resumed after frame ``index`` would read again."""
         retain_frames(self._source, self._first, last=max(self._plan.remembered, index + 1 - self._shown[0][0]))
 
     @property

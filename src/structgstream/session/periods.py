@@ -143,8 +143,8 @@ class PeriodPlan:
     def measures(self, index: int, pts_seconds: float, keys: KeyFrames) -> bool:
         """Whether :meth:`add` needs the residual of frame ``index``: it is the first, or a key frame follows soon.
 
-        If ``config.frames`` exceeds the shortest group, every frame is needed, because a resumed run cannot reconstruct
-        which key frame was expected in an earlier group.
+        If ``config.frames`` is :data:`MIN_FRAMES` or more, every frame is needed, because a resumed run cannot
+        reconstruct which key frame was expected in an earlier group.
         """
         if self._config.residual is None or self._first is None:
             return False

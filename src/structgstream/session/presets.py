@@ -184,8 +184,8 @@ def preset_named(name: str) -> StreamConfig:
 
 
 def with_budget(config: StreamConfig, *, name: str | None, quality: float | None, mbits: float | None) -> StreamConfig:
-    """``config`` with another quality, by 2^-quality of which every quantization step is multiplied, and a target rate
-    in Mbit/s, if they are given. Raises ConfigError if the codec is not ``compact``, or a value is out of range."""
+    """``config`` with another ``quality`` (``RoundingConfig.quality``) and a target rate of ``mbits`` Mbit/s, if they
+    are given. Raises ConfigError if the codec is not ``compact``, or a value is out of range."""
     if quality is None and mbits is None:
         return config
     if config.codec != "compact":

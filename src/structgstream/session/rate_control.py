@@ -13,9 +13,10 @@ Note [Windows]
 ~~~~~~~~~~~~~~~
 The budget of a delta packet is computed from a window that ends a third of its length in the future. The sizes of its
 past packets are known, and the size of a key packet in its future part is predicted. The delta packets of the future
-part share the remainder. So bytes are saved before a key packet comes. A key packet contains all changes since frame 0;
-its predicted size is that of a delta packet times the square root of its frame number (the measured sizes are 0.98 to
-1.13 times that in 3 streams of 2 captures, frames 1 to 19).
+part share the remainder. So bytes are saved before a key packet comes. A key packet contains all changes since the
+period's first frame. Its size is predicted to grow with the square root of its distance from that frame, from that of
+the last key packet, other than a period's first, or, before there is one, from the mean size of a delta packet (the
+measured sizes are 0.98 to 1.13 times this root times a delta packet's size in 3 streams of 2 captures, frames 1 to 19).
 
 Note [Media time]
 ~~~~~~~~~~~~~~~~~
@@ -176,7 +177,8 @@ class RateController:
 
 
 def with_rate_control(config: OnlineConfig, rate_scale: float) -> OnlineConfig:
-    """``config``, its rate weight times ``rate_scale`` and its thresholds for spawning times its square root."""
+    """``config`` with its rate weight multiplied by ``rate_scale``, its gradient threshold for spawning by the square
+    root of ``rate_scale``, and its threshold of missing content too, but only if ``rate_scale`` is above 1."""
     if rate_scale == 1.0:
         return config
     rounding, patching, spawn = config.rounding, config.patching, config.spawn

@@ -30,7 +30,7 @@ from structgstream.training.views import View, blackened
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss terms; terms of weight zero are not computed."""
+    """Weights of the loss terms; terms other than L1 and SSIM are not computed if their weight is zero."""
 
     l1: float = 1.0
     """On the mean absolute difference (paper: 1; Scaffold-GS: 0.8)."""
@@ -53,9 +53,10 @@ class InitialLossWeights(LossWeights):
 
 
 def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum"], backend: Backend) -> Tensor:
-    """L_vol: the product of the three scales ``[N, 3]`` of every Gaussian with an opacity ``[N]`` above zero.
+    """L_vol: the products of the three scales ``[N, 3]`` of each Gaussian, summed or averaged.
 
-    The others must have scale 0, so that they add nothing to the sum; a mean counts positive opacities only.
+    The sum is over all ``N``; a mean divides it by the number of opacities ``[N]`` above zero. Gaussians that dropout
+    (``PerturbationConfig``) sets to opacity 0 keep their scales, and so stay in the sum.
     """
     total, drawn = backend.volume(scales, opacities)
     return total / drawn.clamp(min=1) if reduction == "mean" else total

@@ -264,7 +264,8 @@ class LastPass:
     """Mean loss terms and PSNR over the last visits of the views; tensors are read on access only.
 
     Args:
-        after: number of first iterations to ignore: all but one less than two passes, which hold a whole one.
+        after: number of first iterations to ignore. With ``n`` views the last ``2 n - 1`` iterations should be left:
+            they contain every view, because they contain a whole pass.
         terms_after: the same for loss terms, where not every visit of a view has terms that can be compared.
     """
 

@@ -74,7 +74,8 @@ class RoundingConfig:
         return self.rate_weight * 4.0**-self.quality
 
     def steps(self, pixel: float) -> dict[ParameterName, float]:
-        """The step of every dynamic parameter; ``pixel`` is the size of a pixel in scene units (:func:`pixel_size`)."""
+        """The step in packets of every parameter that can be quantized, dynamic or not; ``pixel`` is the size of a
+        pixel in scene units (:func:`pixel_size`)."""
         units = {"position_pixels": pixel}
         return {p.name: self.at_quality(p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
 

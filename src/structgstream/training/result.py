@@ -57,7 +57,8 @@ class FitResult(Generic[SceneT]):
         spawned: free Gaussians added in this frame.
         pruned: free Gaussians removed in this frame.
         counts: further counts by name.
-        seconds: wall-clock seconds by stage (``render``, ``loss``, ``backward``, ``optimise``, ``patch``, ...).
+        seconds: wall-clock seconds by stage (``generate``, ``rasterise``, ``loss``, ``backward``, ``optimise``, ...;
+            native iterations are one stage, ``iterations``).
         losses: mean of each loss term over the last pass through the cameras.
     """
 

@@ -29,8 +29,8 @@ Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 PROCESSOR_VIEWS = 4
-"""On the processor so many views are computed together, or one for each thread if these are more: its caches hold few
-pictures. A GPU takes all at once, since its host queues every operation."""
+"""Number of views that are computed together on the CPU, whose caches hold few pictures; with more threads than this,
+one for each thread. On a GPU all are computed together, because the host has to queue every operation."""
 MAX_PHASES = 8
 """Ratios of sizes whose pattern repeats after more pixels than this are left to torch."""
 

@@ -105,8 +105,8 @@ def free_bytes(path: Path) -> int | None:
 def check_room(free: int | None, *, largest: int, closing: int, where: str, frames: int) -> None:
     """Check that the next packet and the end of the stream fit. Raises StorageError if they may not.
 
-    All sizes are bytes: ``free`` ones are left (None if that is not known), the ``largest`` packet so far has, the next
-    one included, and ``closing`` the stream takes.
+    All sizes are in bytes: ``free``, what is left on the disk (None if unknown); ``largest``, the largest packet so far
+    or the next one; ``closing``, what closing the stream writes.
     """
     needed = MARGIN_PACKETS * largest + closing
     if free is not None and free < needed:

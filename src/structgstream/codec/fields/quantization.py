@@ -112,9 +112,9 @@ class RateTerm:
         weight: float,
         free: bool,
     ) -> "RateTerm | None":
-        """The rate term of changes of anchors' parameters, and of free Gaussians' if they count, from their present
-        ``values`` by name; those without a step do not count. None without any, and unless ``weight``, what a kilobyte
-        adds to the loss, is positive."""
+        """The rate term of changes from the present ``values`` of anchors' parameters and, if ``free``, of those of
+        free Gaussians; only parameters in ``steps`` count. None if there is none, or if ``weight``, what a kilobyte
+        adds to the loss, is not positive."""
         names = (*trainable("anchor"), *trainable("free")) if free else trainable("anchor")
         counted: dict[ParameterName, float] = {name: steps[name] for name in names if name in steps and name in values}
         if not counted or weight <= 0.0:
@@ -133,7 +133,7 @@ class RateTerm:
         return replace(self, before=before)
 
     def value(self, values: Mapping[ParameterName, Tensor], backend: Backend) -> Tensor:
-        """Weighted sum of log2(1 + distance in bins), in kilobytes."""
+        """The loss term: the sum of log2(1 + distance in bins), in bits, times :attr:`weight_per_bit`."""
         changed = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
         before = [self.before[name] for name in self.steps]
         return self.weight_per_bit * backend.change_bits(changed, before, [*self.steps.values()])

@@ -34,7 +34,8 @@ PURPOSE = "published copy of a stream"
 _FIRST_WAIT_SECONDS = 0.5
 _LONGEST_WAIT_SECONDS = 30.0
 _MORE_REMOVED = 8
-"""So many files more than it copies may a round remove: what an earlier run has left must not hold up a live one."""
+"""A round removes at most this many files more than it copies, so that removing the files of an earlier run does not
+delay the copying of a live one."""
 
 
 class AnotherStreamError(StorageError):

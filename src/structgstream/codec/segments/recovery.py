@@ -109,7 +109,8 @@ def empty_manifest(header: StreamHeader, period: PeriodEntry, *, sequence: int =
 
 
 def with_frame(draft: Draft, part: PartEntry, record: bytes, edge: Edge) -> Draft:
-    """With one more frame in the group that is being written: its part, and the record that this is."""
+    """``draft`` with one more frame in the group that is being written; ``record`` is the content of the file that
+    ``part`` describes."""
     manifest = draft.manifest
     manifest = replace(manifest, live=True, edge=edge, parts=(*manifest.parts, part))
     return replace(draft, manifest=manifest, records=(*draft.records, record))
@@ -203,7 +204,8 @@ def find(store: Store) -> Draft | None:
 def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
     """Those of the files ``there`` that this manifest and its pages do not name, or that have left its window.
 
-    The first segment of the running period stays: resuming needs its first frame.
+    The first segment of the running period is kept, because resuming needs its first frame. History pages are always
+    kept, because other pages may name them.
     """
     first, kept = manifest.window.first_segment, running_period(manifest).first_segment
     listed = manifest.segments[0].segment if manifest.segments else next_segment(manifest)

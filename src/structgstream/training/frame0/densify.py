@@ -36,7 +36,7 @@ class GrowthConfig:
     """Mean view-space gradient (NDC) above which a Gaussian proposes an anchor at the coarsest level; doubles with each
     finer level (Scaffold-GS: 2e-4)."""
     eligible_count: int = 40
-    """A Gaussian proposes anchors only if it was drawn more often than this since the last growing."""
+    """A Gaussian proposes anchors only once it was drawn more often than this; then its statistics begin again."""
     prune_visits: int = 80
     """An anchor can be pruned by opacity once it was in view more often than this."""
     max_anchors: int = 1_000_000

@@ -128,7 +128,8 @@ class EnvironmentConfig:
     DEGREE: ClassVar[int] = 2
     """Degree of the spherical harmonics, 0 to 2."""
     SMOOTHNESS: ClassVar[float] = 1e-3
-    """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the mean weight of the pixels."""
+    """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the sum of the pixels' weights divided
+    by 4 pi, about the diagonal of the normal equations."""
     MIN_WEIGHT: ClassVar[float] = 1e-2
     """Added to a pixel's transparency (1 - coverage) to give its weight, so that covered pixels count a little."""
     STEP: ClassVar[float] = 1 / 256

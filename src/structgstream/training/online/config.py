@@ -66,8 +66,8 @@ class SceneFlowConfig:
     rounds: int = 2
     """1: flow between pictures only; 2: also from the rendering to the pictures, in frames in which much moves fast."""
     views: int = 12
-    """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
-    every second or third, in turn."""
+    """Approximate largest number of views in which flow is estimated and missing content is searched for; of more
+    views each frame takes every second or third, in turn."""
 
     FEW_FAST: ClassVar[float] = 0.015
     """Share of the dynamic primitives that move fast (``scene_flow.FAST_SHARE``), above which much does. Up to it these

@@ -43,9 +43,9 @@ LEAVES: tuple[ParameterName, ...] = (
     "free_logit_opacities",
     "free_colors",
 )
-"""Rows of a scene that back-ends' own iterations know, in their order (``values.FIT_LEAVES``)."""
+"""Parameters that the back-ends' own iterations can train, in the order of ``FitFrame.leaves``."""
 NATIVE_LOSSES = frozenset({"l1", "ssim", "volume"})
-"""Weights of a view's loss that they know."""
+"""Fields of ``LossWeights`` whose terms the back-ends' own iterations compute."""
 NATIVE_SETTINGS = frozenset(
     {
         *("iterations", "extra_iterations", "losses", "rates", "smoothness", "rounding", "mean_of_last"),
@@ -53,9 +53,9 @@ NATIVE_SETTINGS = frozenset(
         *("dynamic", "appearance_rank", "patching", "motion", "scene_flow", "spawn", "motion_prior", "exposure"),
     }
 )
-"""Fields of :class:`OnlineConfig` that they know, or that do not concern them."""
+"""Fields of :class:`OnlineConfig` that the back-ends' own iterations follow, or that do not affect them."""
 TERMS = ("l1", "ssim", "volume", "smoothness")
-"""Columns of ``FitPlan.terms``; the last one after them is their weighted sum."""
+"""The first columns of ``FitPlan.terms``; the last one is the loss: their weighted sum plus the rate term."""
 REPORT_INTERVAL = 10
 """Iterations between reports of progress, where a back-end runs them."""
 

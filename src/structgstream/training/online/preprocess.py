@@ -47,14 +47,14 @@ MIN_SEARCH_PIXELS = 240
 """Flow is searched up to half of the pictures' size, or, if the longer side of that has fewer pixels, up to their full
 size: in small pictures what moves is small, too."""
 CELLS, REACH_CELLS = 80, 12
-"""The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
-of them: 15 per cent of it."""
+"""Number of cells along the picture's longer side in the search for large motion, and the largest displacement, in
+cells, that the search finds: 15 per cent of the longer side."""
 COLOR_SHARE = 1 / 640
-"""Radius of the means of colours that flow is checked by, of the picture's longer side."""
+"""Radius of the squares whose mean colours flow is checked by (``flow.same_color``), relative to the longer side."""
 MISSED_CELLS, CONSISTENT_SHARE = 3, 0.5
-"""Large motion is searched for around squares of so many cells, in each of which less than this share of the changed
-pixels has consistent flow: what has left its own outline, and not the narrow bands that slower motion occludes. The
-search compares squares of three cells."""
+"""Large motion is searched for around squares of this many cells on a side if, in each of their cells, less than this
+share of the changed pixels has consistent flow. That finds objects that have moved out of their own outline, and leaves
+out the narrow bands that slower motion occludes. The search compares squares of three cells."""
 REPEATED_LEVELS = 0.2
 """Mean absolute difference, in levels of 255, below which a picture without a changed pixel is the last one once more.
 
@@ -213,8 +213,8 @@ def _detect_changes(
 
 
 def _are_repeated(then: Tensor, now: Tensor, masks: Tensor | None, *, same: list[int]) -> list[bool]:
-    """Whether each of the pictures ``now`` is ``then`` once more: of those, ``same``, in which no pixel has changed.
-    ``masks`` are the pixels of both."""
+    """For each view, whether its picture in ``now`` repeats that in ``then``. Only views in ``same``, where no pixel
+    has changed, can; ``masks`` are the pixels that count in both pictures."""
     if not same:
         return [False] * len(now)
 
@@ -253,8 +253,9 @@ def flow_map(
 ) -> FlowMaps:
     """Flow between two pictures of one camera.
 
-    It is searched in a box for each part of ``changed``, or in one around all, and where it is inconsistent again for
-    motion by more than things are large (:func:`block_search`). Outside the boxes the confidence is zero.
+    It is estimated in one box for each part of ``changed``, or in one box around all parts. Where the result is
+    inconsistent, a second search looks for objects that move farther than their own size (:func:`block_search`).
+    Outside the boxes the confidence is zero.
 
     Args:
         first: ``[H, W, 3]`` uint8, on the processor.

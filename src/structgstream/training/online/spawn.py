@@ -58,9 +58,9 @@ class Spawned:
 
     Args:
         free: the new free Gaussians.
-        refused_count: how many more there were, if these are more than ``SpawnRules.most``; always 0
-            where Gaussians are coarser then (``SpawnRules.overflow``).
-        merged_count: how many more there would be, had they not been made coarser for that reason.
+        refused_count: number of candidates that were not spawned because there were more than ``SpawnRules.most``;
+            always 0 with ``SpawnRules.overflow`` ``coarser``.
+        merged_count: how many fewer there are because they were made coarser for that reason.
     """
 
     free: FreeGaussians
@@ -462,7 +462,7 @@ def prune_and_spawn(
         active_tiles: by view index, the tiles that the dynamic part reaches.
         first_identity: identity of the first new Gaussian.
         baseline: residuals of frame 0; None for none.
-        room: largest number of new Gaussians.
+        room: largest number of free Gaussians of the dynamic part, kept and new ones together.
         config: the rules.
         backend: the compute back-end.
     """

@@ -26,8 +26,9 @@ class ViewResidual:
     Args:
         view: the picture, reduced.
         wrong: ``[h, w]`` bool, pixels whose residual exceeds the threshold.
-        missing_share: ``[h, w]`` share of the 5 x 5 pixels around whose residual exceeds frame 0's by the threshold.
-        missing_pixels: share of the pixels that count of which more than half is missing.
+        missing_share: ``[h, w]`` share of the 5 x 5 pixels around each pixel whose residual exceeds frame 0's by more
+            than the threshold.
+        missing_pixels: share of the pixels that count whose ``missing_share`` is above one half.
     """
 
     view: View
