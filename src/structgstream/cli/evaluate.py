@@ -320,6 +320,6 @@ def _cells(scores: "Scores | None", columns: Columns) -> list[str]:
 
 def quality_text(report: "Report") -> str:
     """The mean PSNR as text, with that after frame 0's colour fit."""
-    held = report.mean.psnr_camera_color
-    corrected = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
+    color_fitted = report.mean.psnr_camera_color
+    corrected = "" if color_fitted is None else f" ({color_fitted:.2f} after frame 0's colour fit)"
     return f"{report.mean.psnr:.2f} dB{corrected}"

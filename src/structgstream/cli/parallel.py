@@ -247,7 +247,7 @@ STYLES = {
     "done": ("●", "green"),
     "failed": ("✗", "red"),
 }
-WORST_FIRST = ("failed", "running", "ready", "waiting for the track", "done")
+SHOWN_FIRST = ("failed", "running", "ready", "waiting for the track", "done")
 OTHERS = ("running", "ready", "waiting for the track", "failed")
 ROWS = 6
 SHOWN = 8
@@ -255,12 +255,12 @@ SHOWN = 8
 
 def cells(states: Sequence["State"], *, width: int) -> Text:
     """A sign per group; of many groups, one for several, which shows the first of their states in
-    :data:`WORST_FIRST`."""
+    :data:`SHOWN_FIRST`."""
     share = max(1, -(-len(states) // (width * ROWS)))
     text = Text()
     for place, start in enumerate(range(0, len(states), share), 1):
         several = states[start : start + share]
-        text.append(*STYLES[next(name for name in WORST_FIRST if name in several)])
+        text.append(*STYLES[next(name for name in SHOWN_FIRST if name in several)])
         if place % width == 0:
             text.append("\n")
     return text

@@ -80,10 +80,10 @@ class SeamBlend:
             for name, step in self._steps.items()
         }
         self._thresholds = {name: _thresholds(difference) for name, difference in self._differences.items()}
-        self._light: dict[FieldName, Tensor] = {}
+        self._exposure: dict[FieldName, Tensor] = {}
         for name in fields_of("shared"):
             if name in steps and (difference := _bins(then[name] - now[name], steps[name])).any():
-                self._light[name], self._steps[name] = difference, steps[name]
+                self._exposure[name], self._steps[name] = difference, steps[name]
 
     @property
     def blended(self) -> int:
@@ -138,8 +138,8 @@ class SeamBlend:
     def _faded(self, name: FieldName) -> Tensor:
         """The differences of a field that remain in this frame, in quantization steps."""
         share = self._left_frames / (FADE_FRAMES + 1)
-        if name in self._light:
-            return (self._light[name].double() * share).round().long()
+        if name in self._exposure:
+            return (self._exposure[name].double() * share).round().long()
         return (self._differences[name].double() * share + self._thresholds[name]).floor().long()
 
 

@@ -265,7 +265,7 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
     remaining = [name for name in cameras if any(name in pair for pair in errors)]
     while remaining:
         shares = {name: _share(name, bad, weights, off) for name in remaining}
-        worst = max(remaining, key=lambda name: (shares[name], _amount(name, errors, off)))
+        worst = max(remaining, key=lambda name: (shares[name], _median_error(name, errors, off)))
         if shares[worst] < OFF_SHARE:
             break
         off.append(worst)
@@ -311,7 +311,7 @@ def _share(name: str, bad: Collection[Pair], weights: Mapping[Pair, int], off: C
     return sum(weight for pair, weight in own.items() if pair in bad) / total if total else 0.0
 
 
-def _amount(name: str, errors: Mapping[Pair, PairError], off: Collection[str]) -> float:
+def _median_error(name: str, errors: Mapping[Pair, PairError], off: Collection[str]) -> float:
     """Median error of a camera's pairs, to choose among cameras of equal shares."""
     own = [error.pixels for pair, error in errors.items() if name in pair and not set(pair) & set(off)]
     return float(np.median(own)) if own else 0.0

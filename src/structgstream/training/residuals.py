@@ -85,9 +85,9 @@ def box_mean(values: Tensor, pixels: int) -> Tensor:
 def _sum_around(values: Tensor, dim: int, reach: int) -> Tensor:
     """Sums over ``reach`` elements on each side along ``dim``, as far as they exist."""
     total, size = values.clone(), values.shape[dim]
-    for apart in range(1, min(reach, size - 1) + 1):
-        total.narrow(dim, apart, size - apart).add_(values.narrow(dim, 0, size - apart))
-        total.narrow(dim, 0, size - apart).add_(values.narrow(dim, apart, size - apart))
+    for shift in range(1, min(reach, size - 1) + 1):
+        total.narrow(dim, shift, size - shift).add_(values.narrow(dim, 0, size - shift))
+        total.narrow(dim, 0, size - shift).add_(values.narrow(dim, shift, size - shift))
     return total
 
 

@@ -196,10 +196,10 @@ def dilated(values: Tensor, reach: int) -> Tensor:
     picture; of masks, where any is True. By shifted maxima, which take a thirtieth of ``max_pool2d``'s time."""
     for dim in (-2, -1):
         found, size = values.clone(), values.shape[dim]
-        for apart in range(1, min(reach, size - 1) + 1):
-            for first, other in ((apart, 0), (0, apart)):
-                part = found.narrow(dim, first, size - apart)
-                torch.maximum(part, values.narrow(dim, other, size - apart), out=part)
+        for shift in range(1, min(reach, size - 1) + 1):
+            for first, other in ((shift, 0), (0, shift)):
+                part = found.narrow(dim, first, size - shift)
+                torch.maximum(part, values.narrow(dim, other, size - shift), out=part)
         values = found
     return values
 

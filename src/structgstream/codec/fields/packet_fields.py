@@ -108,7 +108,7 @@ GROUPS = _side_by_side([(parameter.path, parameter.columns) for parameter in FRE
 MAX_FREE = 2**18
 """Largest number of free Gaussians of a scene: symbols can cost less than a bit, so bytes do not bound it."""
 _MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
-_LED = (12, 13)  # columns predicted from the change in the column before: green and blue
+_PREDICTED_BY_LEFT = (12, 13)  # columns predicted from the change in the column before: green and blue
 _FRAME_BITS = 32  # an identity is frame * 2^32 + number
 
 
@@ -210,11 +210,11 @@ def _code_spawned_bins(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, c
     for column in range(FREE_COLUMNS):
         has_mean = column in _MEANS
         mean = int(alive[:, column].sum(dtype=np.int64)) // len(alive) if has_mean and len(alive) else 0
-        led = np.diff(found[:, column - 1], prepend=start[column - 1]) if column in _LED else 0
+        left_change = np.diff(found[:, column - 1], prepend=start[column - 1]) if column in _PREDICTED_BY_LEFT else 0
         errors = None
         if new is not None:
             true = new[:, column].astype(np.int64)
-            errors = true - mean if has_mean else np.diff(true, prepend=start[column]) - led
+            errors = true - mean if has_mean else np.diff(true, prepend=start[column]) - left_change
         length, before = _length(one), _length(two)
         errors = coder.numbers(
             "free.born",
@@ -226,7 +226,7 @@ def _code_spawned_bins(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, c
             ],
             counts=[FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13],
         )
-        found[:, column] = errors + mean if has_mean else np.cumsum(errors + led) + start[column]
+        found[:, column] = errors + mean if has_mean else np.cumsum(errors + left_change) + start[column]
         if not -(2**31) <= int(found[:, column].min()) <= int(found[:, column].max()) < 2**31:
             raise StreamError(f"{where} has a bin beyond 32 bits; it is damaged.")
         one, two = errors, one

@@ -112,14 +112,14 @@ def solve_structure(
         starts = [_with_roving(start, frames, lens) for start in starts]
         best = _best_attempt(keypoints, matches, starts, stills=pictures)
         if best.size[0] == 0 or best.size[0] == best.size[1]:
-            raise CalibrationError(_nothing_roving(keypoints, matches, best.pairs, [*frames]))
+            raise CalibrationError(_no_roving_message(keypoints, matches, best.pairs, [*frames]))
         if best.size[0] < 3:
             raise CalibrationError(
                 f"The roving video connects {best.size[0]} of {len(pictures)} cameras, fewer than three; walk slowly "
                 "from the view of each camera to that of the next, around the whole set."
             )
     if best.model is None or best.size[0] < 3:
-        raise CalibrationError(_nothing(pictures, matches, best.pairs))
+        raise CalibrationError(_no_model_message(pictures, matches, best.pairs))
     solved = _finished(best, keypoints, pictures, frames, lens=lens)
     if solved.roving is not None:
         placed = [] if alone.model is None else placed_in(alone.model)
@@ -181,7 +181,7 @@ def _with_roving(
     return {**start, **dict.fromkeys(frames, guessed_camera(lens, number, (width, height), float(np.median(degrees))))}
 
 
-def _nothing_roving(
+def _no_roving_message(
     keypoints: Mapping[str, Keypoints], matches: Matches, pairs: Mapping[Pair, Any], frames: Sequence[str]
 ) -> str:
     """Why no frame of the roving camera could be placed."""
@@ -328,7 +328,7 @@ def _split(found: SolvedCalibration, roving: Collection[str]) -> SolvedCalibrati
     )
 
 
-def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
+def _no_model_message(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     """Why no three cameras could be placed."""
     if alone := [name for name in pictures if not any(name in pair for pair in pairs)]:
         reason = (

@@ -143,12 +143,16 @@ def scale_findings(
             f"like {like}; convert them, or give a distance between two cameras."
         )
         findings.append(Finding("error", sentence))
-    if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign(points, depths, cameras)):
+    if (
+        points is not None
+        and len(points) >= MIN_POINTS
+        and (sentence := _foreign_points(points, depths, cameras))
+    ):
         findings.append(Finding("error", sentence))
     return findings
 
 
-def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
+def _foreign_points(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
     """A sentence when the points that came along are not of these cameras."""
     fits = float((cameras_per_point(points, cameras) >= 2).mean())
     if len(depths) < MIN_POINTS:

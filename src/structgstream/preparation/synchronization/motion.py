@@ -41,9 +41,9 @@ CHANGES_SIDE = 160  # of reduced pictures, pixels: events are compared along lin
 SMOOTHING = 1.0  # standard deviation, reduced pixels
 SAMPLED = 100  # frames whose noise is measured
 NOISE_FACTOR, MIN_NOISE = 4.0, 0.5  # changes below this many times the median change are noise
-MOST = 30.0  # larger changes count as this one: a bright shirt is not more of an event than a dark one
+MAX_CHANGE = 30.0  # larger changes count as this one: a bright shirt is not more of an event than a dark one
 UNITS = 4  # of stored changes in a grey level
-STILL = 5e-4  # share of MOST of a mean change below which nothing moves
+STILL = 5e-4  # share of MAX_CHANGE of a mean change below which nothing moves
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Changes:
     @property
     def moving(self) -> bool:
         """Whether anything moves."""
-        return len(self.amounts) > 1 and float(self.amounts.mean()) > STILL * MOST * UNITS
+        return len(self.amounts) > 1 and float(self.amounts.mean()) > STILL * MAX_CHANGE * UNITS
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
@@ -93,7 +93,7 @@ def reduced_changes(reduced: Sequence[NDArray[np.uint8]], stamps: Floats, size: 
     before = cv2.GaussianBlur(reduced[0].astype(np.float32), (0, 0), SMOOTHING)
     for index, grey in enumerate(reduced[1:]):
         smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING)
-        above = np.clip(np.abs(smooth - before) - noise, 0, MOST)
+        above = np.clip(np.abs(smooth - before) - noise, 0, MAX_CHANGE)
         amounts[index] = np.rint(above * UNITS)
         before = smooth
     return Changes(amounts, (stamps[1:] + stamps[:-1]) / 2, size)

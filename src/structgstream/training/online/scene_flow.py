@@ -90,8 +90,8 @@ def lift_flow(
         return LiftedFlow(priors, torch.zeros_like(fast), fast, 0)
     near, distances = nearest(points, points[informed], NEIGHBOURS)
     neighbours, affinities = informed[near].to(centers.device), weights_by_distance(distances.to(centers.device))
-    apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
-    affinities = affinities * torch.exp(-0.5 * apart / COLOR_BANDWIDTH**2)
+    color_distances = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
+    affinities = affinities * torch.exp(-0.5 * color_distances / COLOR_BANDWIDTH**2)
     viewports = [view.camera.viewport(centers) for view in views]
     # The tolerance has a unit of one pixel at the reference size: errors of the flow of what hardly moves come from how
     # bodies bend, from occlusion and from blending, which are as large in space however many pixels show them.

@@ -65,8 +65,8 @@ class MotionSmoothness:
         if config.FEATURE_BANDWIDTH > 0.0:
             features = scene.features.detach()
             features = features / features.std(0).clamp(min=1e-6)
-            apart = (features[rows] - features[:, None]).square().mean(-1)
-            affinities = affinities * torch.exp(-0.5 * apart / config.FEATURE_BANDWIDTH**2)
+            feature_distances = (features[rows] - features[:, None]).square().mean(-1)
+            affinities = affinities * torch.exp(-0.5 * feature_distances / config.FEATURE_BANDWIDTH**2)
         shares = affinities / affinities.sum(1, keepdim=True).clamp(min=1e-6)
         return cls(config.weight, positions.detach(), rows, shares, pixel, config.SLACK_PIXELS)
 
