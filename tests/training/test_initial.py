@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
+from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, in_free_space
-from structgstream.training.frame0.seeding import voxel_centers
+from structgstream.training.frame0.seeding import seeded_scene, voxel_centers
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import moving_world, psnr
@@ -122,3 +125,17 @@ def test_rates_of_the_reference_schedule() -> None:
     assert rates["color_mlp"] == pytest.approx(0.00406, rel=3e-3)
     assert rates["covariance_mlp"] == 0.004
     assert "anchor_positions" not in rates, "they are fixed"
+
+
+def test_a_frame_0_without_anchors_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anchors that stay transparent are pruned; a stream of nothing would be written without a word."""
+
+    def transparent(*arguments: Any, **options: Any) -> Scene:
+        scene = seeded_scene(*arguments, **options)
+        head = scene.mlps.opacity
+        head = head._replace(w2=torch.zeros_like(head.w2), b2=torch.full_like(head.b2, -9.0))
+        return replace(scene, mlps=scene.mlps._replace(opacity=head))
+
+    monkeypatch.setattr("structgstream.training.frame0.fit.seeded_scene", transparent)
+    with pytest.raises(CaptureError, match=r"lost all of its \d+ anchors in training"):
+        fit(moving_world(1))

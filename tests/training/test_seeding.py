@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.training.frame0.seeding import neighbor_distances, seeded_scene, voxel_centers
+from structgstream.kernels.values import HeadWeights
+from structgstream.training.frame0.seeding import neighbor_distances, random_head, seeded_scene, voxel_centers
 
 
 def seeded(points: torch.Tensor, **options):
@@ -53,6 +54,24 @@ def test_every_gaussian_can_begin_drawn_whatever_camera_looks() -> None:
         drawn[wanted] = [(torch.relu(inputs @ h.w1.T + h.b1) @ h.w2.T + h.b2 > 0).float().mean() for h in heads]
     assert min(drawn[True]) == 1.0
     assert max(drawn[False]) < 1.0, "as Scaffold-GS draws them, some begin transparent"
+
+
+@pytest.mark.parametrize(("seed", "distance_input"), [(1000005, False), (98, True)])
+def test_no_seed_begins_with_nothing_visible(seed: int, distance_input: bool) -> None:
+    """With the first weights of these seeds no Gaussian has a positive opacity, so all anchors would be pruned."""
+
+    def visible(head: HeadWeights) -> bool:
+        directions = torch.nn.functional.normalize(
+            torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1
+        )
+        inputs = torch.cat([torch.zeros(64, 32), directions, torch.ones(64, int(distance_input))], dim=1)
+        return bool((torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2 > 0).any())
+
+    generator = torch.Generator().manual_seed(seed)
+    assert not visible(random_head(35 + int(distance_input), 32, 5, generator))
+    generator.manual_seed(seed)
+    begun = seeded(torch.rand(100, 3), generator=generator, distance_input=distance_input)
+    assert visible(begun.mlps.opacity)
 
 
 def test_the_seed_decides_the_weights() -> None:

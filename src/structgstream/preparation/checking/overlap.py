@@ -143,11 +143,7 @@ def scale_findings(
             f"like {like}; convert them, or give a distance between two cameras."
         )
         findings.append(Finding("error", sentence))
-    if (
-        points is not None
-        and len(points) >= MIN_POINTS
-        and (sentence := _foreign_points(points, depths, cameras))
-    ):
+    if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign_points(points, depths, cameras)):
         findings.append(Finding("error", sentence))
     return findings
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig, rig_radius
+from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.scene.sampling import RigSampling
@@ -219,6 +220,9 @@ def fit_first_frame(
         seed: of all random numbers.
         on_step: called after every iteration.
         roving: pictures of a roving camera, in normalised units; every second iteration takes one of them.
+
+    Raises:
+        CaptureError: too few points, or no anchor is left.
     """
     generator = torch.Generator().manual_seed(seed)
     template = seeded_scene(
@@ -233,9 +237,15 @@ def fit_first_frame(
         generator=generator,
         all_drawn=config.all_drawn,
     )
-    return _fit(
+    result = _fit(
         frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step, roving=roving
     )
+    if not len(result.scene.anchors):
+        raise CaptureError(
+            f"Frame {frame.index} lost all of its {len(template.anchors)} anchors in training, so its poses or initial "
+            "points do not fit its pictures; look at structgstream prepare --check, or give another --seed."
+        )
+    return result
 
 
 def fit_first_frame_again(

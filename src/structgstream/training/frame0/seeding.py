@@ -6,7 +6,9 @@ Note [Dead outputs]
 F_alpha has one output for each of an anchor's K Gaussians, shared by all anchors. Only Gaussians of positive opacity
 are drawn and get a gradient, as with a ReLU. With random weights about half of the outputs are initially negative for
 every anchor, because all features start equal, and an output that no anchor draws stays dead: of K = 5, one to four
-survive, depending on the seed. ``all_drawn`` avoids this: a smaller K, with all outputs initially positive.
+survive, depending on the seed. ``all_drawn`` avoids this: a smaller K, with all outputs initially positive. Without it
+F_alpha is drawn again while hardly anything would be visible, as with one seed in 400 (K = 5): no Gaussian would ever
+get a gradient, and all anchors would be pruned.
 
 Note [Honest coverage]
 ~~~~~~~~~~~~~~~~~~~~~~
@@ -64,6 +66,22 @@ def random_head(inputs: int, hidden: int, outputs: int, generator: torch.Generat
     return HeadWeights(*layer(hidden, inputs), *layer(outputs, hidden))
 
 
+MIN_VISIBLE_SHARE = 0.1
+"""Least share of the directions from which an untrained anchor has a Gaussian of positive opacity."""
+
+
+def _visible_share(opacity: HeadWeights, feature_width: int) -> float:
+    """Share of the directions, at a distance of 1, from which F_alpha gives an anchor without features a positive
+    opacity."""
+    index = torch.arange(256) + 0.5
+    polar, azimuth = torch.acos(1.0 - index / 128.0), math.pi * (1.0 + 5.0**0.5) * index  # Fibonacci's lattice
+    around = torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], dim=1)
+    inputs = torch.ones(len(around), opacity.w1.shape[1])
+    inputs[:, :feature_width], inputs[:, feature_width : feature_width + 3] = 0.0, around
+    outputs = torch.relu(inputs @ opacity.w1.T + opacity.b1) @ opacity.w2.T + opacity.b2
+    return float((outputs > 0.0).any(1).float().mean())
+
+
 def seeded_scene(
     points: Tensor,
     *,
@@ -98,6 +116,8 @@ def seeded_scene(
     heads = [random_head(inputs, hidden_width, width * k, generator) for width in (1, 3, 7)]
     if all_drawn:
         heads[0] = heads[0]._replace(w2=heads[0].w2.abs(), b2=heads[0].b2.abs())
+    while _visible_share(heads[0], feature_width) < MIN_VISIBLE_SHARE:
+        heads[0] = random_head(inputs, hidden_width, k, generator)
     opacity, color, covariance = (HeadWeights(*(w.to(device) for w in head)) for head in heads)
     return Scene(
         anchors=AnchorCloud(
