@@ -371,7 +371,7 @@ export class StreamReader {
     const { name } = this;
     const expected = this.frames.length;
     if (index !== expected) throw new StreamError(`${name} has packet ${index} where packet ${expected} belongs.`);
-    if (this.begins && !this.open && !isKey) {
+    if ((index === 0 || (this.begins && !this.open)) && !isKey) {
       const what = expected ? `A period of ${name}` : name;
       throw new StreamError(`${what} begins with a delta packet; the first must be a key packet.`);
     }

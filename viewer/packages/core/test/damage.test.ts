@@ -148,3 +148,12 @@ test("after damage, records that contradict each other are refused when the end 
   expect(() => reader.finish()).toThrow("has packet 2 where packet 3 belongs");
   expect(() => reader.finish()).toThrow(StreamError);
 });
+
+test("frame 0 is a key packet, also after damage", () => {
+  const [prefix, init, , second] = piecesOf(STREAMS.compact) as Uint8Array[];
+  const delta = second!.slice();
+  viewOf(delta).setUint32(8, 0, true);
+  viewOf(delta).setUint32(delta.length - 4, crc32(delta.subarray(0, -4)), true);
+  const damaged = flipped(record(77, new Uint8Array(30)), 200);
+  expect(() => readStream(joined(prefix!, init!, damaged, delta))).toThrow("begins with a delta packet");
+});
