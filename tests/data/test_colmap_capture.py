@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structgstream.data.open import open_capture
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CaptureError
 from tests.support import captures
 from tests.support.captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 
@@ -163,10 +163,3 @@ def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
     source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
     assert next(source.frames()).images["cam01"].shape == (24, 32, 3)
-
-
-def test_folders_of_other_names_do_not_move(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM_x/FRAME.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}/000000.png", name) for name in RIG])
-    with pytest.raises(CalibrationError, match=r"No camera of .* belongs to the pictures .*'cam00/000000\.png'"):
-        open_capture(tmp_path)

@@ -115,15 +115,6 @@ def test_a_static_scene_of_blender(tmp_path: Path) -> None:
     assert (len(source), len(source.rig)) == (1, 3)
 
 
-def test_one_instant_serves_for_all(tmp_path: Path) -> None:
-    """nerfstudio's file names the pictures of one instant; the folders hold more."""
-    for number in range(3):
-        for frame in range(FRAMES):
-            write_picture(tmp_path / f"images/cam{number:02d}/{frame:06d}.png", picture(number, frame))
-    write_transforms(tmp_path, CAMERAS)
-    assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
-
-
 def test_videos(tmp_path: Path) -> None:
     write_videos(tmp_path, [camera.name for camera in CAMERAS], frames=FRAMES)
     write_transforms(tmp_path, CAMERAS, pattern="NAME.mp4")
