@@ -12,18 +12,11 @@ from structgstream.data.lenses import RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
-from tests.support.calibrations import Truth, truths, write_transforms
+from tests.support.calibrations import truths, write_transforms
 from tests.support.captures import HEIGHT, WIDTH, all_numbers, edit_json, picture, write_picture, write_videos
 
 CAMERAS = truths(dist=())
 FRAMES = 3
-
-
-def pose(camera: Truth) -> list[list[float]]:
-    """Camera to world in OpenGL axes."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.R.T @ np.diag([1, -1, -1]), camera.center
-    return matrix.tolist()
 
 
 def write(path: Path, pattern: str, *, name: str = "transforms.json", cameras: range = range(3), **top: object) -> None:
@@ -33,7 +26,7 @@ def write(path: Path, pattern: str, *, name: str = "transforms.json", cameras: r
         for frame in range(FRAMES):
             file = pattern.replace("CAM", f"cam{number:02d}").replace("FRAME", f"{frame:04d}")
             write_picture(path / file, picture(number, frame))
-            entry = {"file_path": file, "transform_matrix": pose(CAMERAS[number]), "time": frame / FRAMES}
+            entry = {"file_path": file, "transform_matrix": CAMERAS[number].opengl_pose, "time": frame / FRAMES}
             frames.append(entry)
     angle = 2 * math.atan(WIDTH / 2 / 40)
     (path / name).write_text(json.dumps({"camera_angle_x": angle, **top, "frames": frames}))
