@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -158,7 +157,7 @@ def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     for frame in range(FRAMES):
         write_picture(tmp_path / f"images/cam01/{frame:06d}.png", picture(1, frame, width=32, height=24))
-    mixed = RIG.mapped({**RIG.cameras, "cam01": dataclasses.replace(RIG["cam01"].resized(32, 24))})
+    mixed = RIG.mapped({**RIG.cameras, "cam01": RIG["cam01"].resized(32, 24)})
     write_text_model(tmp_path / "sparse", mixed, MODEL)
     source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
