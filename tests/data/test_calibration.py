@@ -48,6 +48,7 @@ def test_three_rows_of_a_pose_are_enough() -> None:
         (np.diag([1, 1, -1, 1]), K, "orthonormal"),
         ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0.2, 3, 1]], K, "last row .* transpose"),
         (np.diag([1, 1, 1, 2]), K, "last row"),
+        (np.eye(4), K.T, "last row of the K .* transpose"),
         (np.eye(3), K, "4x4"),
         ([[1, 2], [3]], K, "cannot be read"),
         ("what", K, "cannot be read"),

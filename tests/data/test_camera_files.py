@@ -36,12 +36,10 @@ def colmap(where: Path) -> None:
 
 
 def test_what_a_mac_leaves_beside_files_is_no_camera_and_no_frame(tmp_path: Path) -> None:
-    write_clip(tmp_path / "json")
-    write_n3dv(tmp_path / "n3dv")
-    for layout, name in (("json", "cam00"), ("n3dv", "cam00")):
-        before = list(open_capture(tmp_path / layout).rig)
-        (tmp_path / layout / f"._{name}.mp4").write_bytes(APPLE_DOUBLE)
-        assert list(open_capture(tmp_path / layout).rig) == before
+    for layout, write in (("json", write_clip), ("n3dv", write_n3dv)):
+        rig = write(tmp_path / layout)
+        (tmp_path / layout / "._cam00.mp4").write_bytes(APPLE_DOUBLE)
+        assert list(open_capture(tmp_path / layout).rig) == list(rig)
     colmap(tmp_path / "colmap")
     assert len(open_capture(tmp_path / "colmap")) == 1
 

@@ -86,6 +86,7 @@ def test_light_that_changes_at_once_is_not_averaged() -> None:
 
 
 def test_equal_pictures_keep_every_bit() -> None:
+    """Of a capture that ends before eight frames."""
     first = film(1)[0]
     frames = [replace(first, index=index) for index in range(5)]
     found = next(denoised(capture(frames), EIGHT).frames())
@@ -178,11 +179,6 @@ def test_a_frame_that_cannot_be_read_ends_the_mean_and_is_reported_when_it_is_it
         next(frames)
     (alone,) = denoised(section(Broken(RIG, film()), frames=1), EIGHT).frames()
     assert alone.mean_of == 4.0
-
-
-def test_a_capture_that_ends_early_is_averaged_to_its_end() -> None:
-    assert next(denoised(capture(film(3)), EIGHT).frames()).mean_of == 3.0
-    assert next(denoised(capture(film(1)), EIGHT).frames()).mean_of == 1.0
 
 
 def test_one_frame_and_live_cameras_are_the_source_itself() -> None:

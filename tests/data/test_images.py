@@ -124,26 +124,24 @@ def test_a_focal_length_and_the_pitch_of_the_sensor(tmp_path: Path, unit: int | 
     assert read_exif(written(tmp_path / "a.jpg", tags)).focal_pixels == pytest.approx(400, rel=1e-3)
 
 
-def test_pictures_that_were_reduced(tmp_path: Path) -> None:
-    tags = {FOCAL: IFDRational(5), RESOLUTION: IFDRational(320), UNIT: 4, ACROSS: 1600}
-    assert read_exif(written(tmp_path / "a.jpg", tags)).focal_pixels == pytest.approx(400)
+LARGE = {FOCAL: IFDRational(5), RESOLUTION: IFDRational(320), UNIT: 4}  # of the sensor's 1600 x 1200 pixels
 
 
-def test_pictures_that_were_turned_without_their_tags(tmp_path: Path) -> None:
-    """As ``jpegtran -rotate 90`` does, here of a picture that was reduced before."""
-    tags = {FOCAL: IFDRational(5), RESOLUTION: IFDRational(320), UNIT: 4, ACROSS: 1600, DOWN: 1200}
-    assert read_exif(written(tmp_path / "a.jpg", tags, size=(300, 400))).focal_pixels == pytest.approx(400)
-    assert read_exif(written(tmp_path / "b.jpg", tags)).focal_pixels == pytest.approx(400)
-
-
-def test_of_two_that_contradict_each_other_the_one_of_film_counts(tmp_path: Path) -> None:
-    """The resolution of the focal plane is often that of another size; where both agree it is the exact one."""
-    film = 26 * 500 / math.hypot(36, 24)
-    tags = {FOCAL: IFDRational(5), UNIT: 4, FILM: 26}
-    wrong = written(tmp_path / "a.jpg", {**tags, RESOLUTION: IFDRational(320)})
-    right = written(tmp_path / "b.jpg", {**tags, RESOLUTION: IFDRational(62)})
-    assert read_exif(wrong).focal_pixels == pytest.approx(film)
-    assert read_exif(right).focal_pixels == pytest.approx(310)
+@pytest.mark.parametrize(
+    ("tags", "size", "focal"),
+    [
+        pytest.param({**LARGE, ACROSS: 1600}, (400, 300), 400, id="reduced"),
+        pytest.param({**LARGE, ACROSS: 1600, DOWN: 1200}, (400, 300), 400, id="reduced, both sides stated"),
+        pytest.param({**LARGE, ACROSS: 1600, DOWN: 1200}, (300, 400), 400, id="then turned by jpegtran, not its tags"),
+        # The resolution is often that of another size; where both agree it is the exact one.
+        pytest.param({**LARGE, FILM: 26}, (400, 300), 26 * 500 / math.hypot(36, 24), id="contradicted by that of film"),
+        pytest.param({**LARGE, RESOLUTION: IFDRational(62), FILM: 26}, (400, 300), 310, id="close to that of film"),
+    ],
+)
+def test_a_focal_length_of_a_picture_of_another_size(
+    tmp_path: Path, tags: dict[int, Any], size: tuple[int, int], focal: float
+) -> None:
+    assert read_exif(written(tmp_path / "a.jpg", tags, size=size)).focal_pixels == pytest.approx(focal)
 
 
 @pytest.mark.parametrize(

@@ -58,17 +58,6 @@ def test_values_that_cannot_be(tmp_path: Path, change: dict[str, Any], error: ty
         open_json_videos(tmp_path)
 
 
-@pytest.mark.parametrize("key", ["K", "viewmat"])
-def test_a_matrix_column_by_column(tmp_path: Path, key: str) -> None:
-    write_clip(tmp_path)
-    edit_json(
-        tmp_path / "cameras.json",
-        lambda content: content["cameras"]["cam01"].update({key: [*zip(*content["cameras"]["cam01"][key])]}),
-    )
-    with pytest.raises(CalibrationError, match="Camera 'cam01' of .*cameras.json: The last row of the .* transpose"):
-        open_json_videos(tmp_path)
-
-
 def test_a_singular_pose_names_the_camera(tmp_path: Path) -> None:
     write_shared_intrinsics(tmp_path)
     edit_json(tmp_path / "cameras.json", lambda content: content["cams"].__setitem__(1, [[0.0] * 4] * 4))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from structgstream import cameras
 from structgstream.data import matching
-from structgstream.data import matching as descriptor_matches
 from structgstream.data.matching import (
     KEYPOINT_SIDE,
     Features,
@@ -147,7 +146,7 @@ def searched(
 def test_matches_are_mutual_and_stand_out(
     monkeypatch: pytest.MonkeyPatch, instants: int, ratio: float, distance: float
 ) -> None:
-    monkeypatch.setattr(descriptor_matches, "BLOCK", 16)  # several blocks, the last one shorter
+    monkeypatch.setattr(matching, "BLOCK", 16)  # several blocks, the last one shorter
     first = descriptors(70, seed=1)
     second = descriptors(60, seed=2, like=first)
     seen = (seen_of(70, instants=instants, seed=3), seen_of(60, instants=instants, seed=4)) if instants else None
@@ -205,15 +204,6 @@ def test_a_pair_needs_its_number_and_share_of_inliers(monkeypatch: pytest.Monkey
     found = count()
     assert count(MIN_INLIERS=found) == found
     assert count(MIN_INLIERS=10 * found) == count(MIN_INLIERS=20, MIN_INLIER_SHARE=1.01) == 0
-
-
-def test_masked_pixels_have_no_keypoints() -> None:
-    mask = np.ones((SIDE, SIDE), bool)
-    mask[:, : SIDE // 2] = False
-    matcher = PairMatcher(pictures(), masks={"a": mask})
-    one, _ = matcher.matches([("a", "b")])["a", "b"]
-    assert len(one)
-    assert matcher.keypoints("a")[:, 0].min() >= SIDE // 2 - 1
 
 
 def test_a_picture_and_a_pair_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

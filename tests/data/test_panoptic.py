@@ -55,14 +55,6 @@ def test_a_camera_whose_folder_is_missing_is_named(tmp_path: Path) -> None:
         open_panoptic(tmp_path)
 
 
-def test_size_of_the_metadata_must_be_the_pictures(tmp_path: Path) -> None:
-    write_panoptic(tmp_path)
-    for meta in (TRAIN, TEST):
-        edit_json(tmp_path / meta, lambda content: content.update(w=72, h=54))
-    with pytest.raises(CalibrationError, match=r"64x48 pixels, .* 72x54"):
-        next(open_panoptic(tmp_path).frames())
-
-
 @pytest.mark.parametrize("text", ["{", "[]", '{"w": 64, "h": 48}'])
 def test_metadata_that_is_something_else(tmp_path: Path, text: str) -> None:
     write_panoptic(tmp_path)

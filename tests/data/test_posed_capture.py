@@ -46,12 +46,16 @@ def owners(found: dict, given: Calibration) -> dict[str, str]:
         (("cam_1", "cam_2", "cam_10"), ("Camera01", "Camera02", "Camera10")),
         (("images/left/0001.png", "images/middle/0001.png", "images/right/0001.png"), ("left", "middle", "right")),
         (("left.png", "middle.png", "right.png"), ("left", "middle", "right")),
+        (  # serial numbers, of one camera more, in what cameras write
+            ("23088", "26580", "23087", "1"),
+            ("take 2_Miqus_7_23088", "take 2_Miqus_8_26580", "take 2_Miqus_9_23087"),
+        ),
     ],
 )
 def test_names_are_matched(names: tuple[str, ...], files: tuple[str, ...]) -> None:
     given = calibration(names)
     found = filmed_by(given, dict.fromkeys(reversed(files), (WIDTH, HEIGHT)), root=ROOT)
-    assert owners(found, given) == dict(zip(files, names, strict=True))
+    assert owners(found, given) == dict(zip(files, names))
     assert list(found) == list(reversed(files))  # the order of the pictures
     assert {camera.lens for camera in found.values()} == {LENS}
 
@@ -63,6 +67,7 @@ def test_names_are_matched(names: tuple[str, ...], files: tuple[str, ...]) -> No
         (("cam1", "cam2", "cam3"), ("a1", "a2", "a4")),  # other numbers
         (("cam1", "cam2"), ("a1", "b1", "a2")),  # one number twice
         (("left", "right", "up"), ("left_right", "right_1", "up_1")),  # one has two of the words
+        (("left/0.png", "right/0.png", "up/0.png"), ("left_x", "right_x", "up_x")),  # folders have whole names
     ],
 )
 def test_names_that_do_not_fit_are_not_guessed(names: tuple[str, ...], files: tuple[str, ...]) -> None:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +14,11 @@ from structgstream.data.lenses import RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
-from tests.support.calibrations import Truth, truths, write_transforms
+from tests.support.calibrations import truths, write_transforms
 from tests.support.captures import HEIGHT, WIDTH, all_numbers, edit_json, picture, write_picture, write_videos
 
 CAMERAS = truths(dist=())
 FRAMES = 3
-
-
-def pose(camera: Truth) -> list[list[float]]:
-    """Camera to world in OpenGL axes."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.R.T @ np.diag([1, -1, -1]), camera.center
-    return matrix.tolist()
 
 
 def write(path: Path, pattern: str, *, name: str = "transforms.json", cameras: range = range(3), **top: object) -> None:
@@ -33,10 +28,15 @@ def write(path: Path, pattern: str, *, name: str = "transforms.json", cameras: r
         for frame in range(FRAMES):
             file = pattern.replace("CAM", f"cam{number:02d}").replace("FRAME", f"{frame:04d}")
             write_picture(path / file, picture(number, frame))
-            entry = {"file_path": file, "transform_matrix": pose(CAMERAS[number]), "time": frame / FRAMES}
+            entry = {"file_path": file, "transform_matrix": CAMERAS[number].opengl_pose, "time": frame / FRAMES}
             frames.append(entry)
     angle = 2 * math.atan(WIDTH / 2 / 40)
     (path / name).write_text(json.dumps({"camera_angle_x": angle, **top, "frames": frames}))
+
+
+def edit_frames(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Changes the entry of each picture."""
+    edit_json(file, lambda content: [change(entry) for entry in content["frames"]])
 
 
 @pytest.mark.parametrize("pattern", ["rgb/CAM/FRAME.png", "FRAME/CAM.png", "images/CAM_FRAME.png", "all/FRAME_CAM.jpg"])
@@ -74,12 +74,7 @@ def test_a_rate_that_is_none(tmp_path: Path, fps: object) -> None:
 def test_times_order_the_pictures_not_their_names(tmp_path: Path, last: float) -> None:
     """Negative ones too, as of takes that are counted from their middle."""
     write(tmp_path, "rgb/CAM/FRAME.png")
-
-    def backwards(content: dict) -> None:
-        for entry in content["frames"]:
-            entry["time"] = last - entry["time"]
-
-    edit_json(tmp_path / "transforms.json", backwards)
+    edit_frames(tmp_path / "transforms.json", lambda entry: entry.update(time=last - entry["time"]))
     expected = [[(camera, frame) for camera in range(3)] for frame in reversed(range(FRAMES))]
     assert all_numbers(open_transforms(tmp_path).frames()) == expected
 
@@ -88,13 +83,10 @@ def test_blenders_two_files(tmp_path: Path) -> None:
     """Paths without a suffix; what the second lists is held out."""
     write(tmp_path, "train/CAM_FRAME.png", name="transforms_train.json", cameras=range(2))
     write(tmp_path, "test/CAM_FRAME.png", name="transforms_test.json", cameras=range(2, 3))
-
-    def without_suffix(content: dict) -> None:
-        for entry in content["frames"]:
-            entry["file_path"] = f"./{entry['file_path'].removesuffix('.png')}"
-
     for name in ("transforms_train.json", "transforms_test.json"):
-        edit_json(tmp_path / name, without_suffix)
+        edit_frames(
+            tmp_path / name, lambda entry: entry.update(file_path=f"./{entry['file_path'].removesuffix('.png')}")
+        )
     source = open_capture(tmp_path)
     assert [len(source.rig.training), len(source.rig.testing)] == [2, 1]
     center = source.rig[source.rig.testing[0]].center
@@ -104,24 +96,11 @@ def test_blenders_two_files(tmp_path: Path) -> None:
 def test_a_static_scene_of_blender(tmp_path: Path) -> None:
     """One picture a camera, no times."""
     write(tmp_path, "train/CAM_FRAME.png", name="transforms_train.json")
-
-    def first_only(content: dict) -> None:
-        content["frames"] = [dict(entry) for entry in content["frames"][::FRAMES]]
-        for entry in content["frames"]:
-            del entry["time"]
-
-    edit_json(tmp_path / "transforms_train.json", first_only)
+    file = tmp_path / "transforms_train.json"
+    edit_json(file, lambda content: content.update(frames=content["frames"][::FRAMES]))
+    edit_frames(file, lambda entry: entry.pop("time"))
     source = open_capture(tmp_path)
     assert (len(source), len(source.rig)) == (1, 3)
-
-
-def test_one_instant_serves_for_all(tmp_path: Path) -> None:
-    """nerfstudio's file names the pictures of one instant; the folders hold more."""
-    for number in range(3):
-        for frame in range(FRAMES):
-            write_picture(tmp_path / f"images/cam{number:02d}/{frame:06d}.png", picture(number, frame))
-    write_transforms(tmp_path, CAMERAS)
-    assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
 
 
 def test_videos(tmp_path: Path) -> None:
@@ -182,13 +161,10 @@ def test_coefficients_count_whatever_the_model_is_called(tmp_path: Path, model: 
 def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:
     """Also where times are null, paths are of another machine, and lenses have COLMAP's names."""
     write(tmp_path, "images/CAM/FRAME.png", fps=60, camera_model="SIMPLE_RADIAL", k1=0.01, w=str(WIDTH), h=HEIGHT)
-
-    def change(content: dict) -> None:
-        for entry in content["frames"]:
-            entry["time"] = None
-            entry["file_path"] = "D:\\scene\\" + entry["file_path"].replace("/", "\\")
-
-    edit_json(tmp_path / "transforms.json", change)
+    edit_frames(
+        tmp_path / "transforms.json",
+        lambda entry: entry.update(time=None, file_path="D:\\scene\\" + entry["file_path"].replace("/", "\\")),
+    )
     source = open_capture(tmp_path)
     assert (len(source), source.fps, list(source.rig)) == (FRAMES, 60.0, ["cam00", "cam01", "cam02"])
 

@@ -2,10 +2,7 @@
 """The pinhole that pictures of a lens are undistorted for."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,6 +24,7 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import small_rig
 from tests.support.lens_cameras import LENSES, MILD, PINCUSHION, WIDE, filmed
+from tests.support.memory_captures import MemoryCapture
 
 
 def pattern(normalised: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -127,45 +125,24 @@ def test_areas_are_averaged_where_pictures_shrink(lens: Lens) -> None:
     assert small.std() < 25
 
 
-@dataclass(frozen=True)
-class Filmed:
-    """Two frames of the pattern through the lenses of a rig; the second is darker."""
-
-    cameras: dict[str, LensCamera]
-    fps: float = 30.0
-    name: str = "take"
-    points: None = None
-
-    @property
-    def rig(self) -> CameraRig:
-        return CameraRig({name: own.camera for name, own in self.cameras.items()}, frozenset({"cam00"}))
-
-    def __len__(self) -> int:
-        return 2
-
-    @cached_property
-    def taken(self) -> dict[str, NDArray[np.uint8]]:
-        return {name: pattern(own.to_normalized(centers(own.camera))) for name, own in self.cameras.items()}
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        for index in range(start, 2):
-            images = {name: image // np.uint8(index + 1) for name, image in self.taken.items()}
-            yield MultiViewFrame(index, index / self.fps, images)
+RIG = small_rig(4)
+CAMERAS = {
+    name: replace(filmed(lens), camera=replace(filmed(lens).camera, viewmat=RIG[name].viewmat, near=0.3))
+    for name, lens in zip(RIG, (MILD, Pinhole(), WIDE, PINCUSHION))
+}
 
 
 @pytest.fixture(scope="module")
-def source() -> Filmed:
-    rig = small_rig(4)
-    lenses = (MILD, Pinhole(), WIDE, PINCUSHION)
-    cameras = [
-        replace(filmed(lens), camera=replace(filmed(lens).camera, viewmat=rig[name].viewmat, near=0.3))
-        for lens, name in zip(lenses, rig)
-    ]
-    return Filmed(dict(zip(rig, cameras)))
+def source() -> MemoryCapture:
+    """Two frames of the pattern through the lenses of :data:`CAMERAS`; the second is darker."""
+    rig = CameraRig({name: own.camera for name, own in CAMERAS.items()}, frozenset({"cam00"}))
+    taken = {name: pattern(own.to_normalized(centers(own.camera))) for name, own in CAMERAS.items()}
+    darker = {name: image // np.uint8(2) for name, image in taken.items()}
+    return MemoryCapture(rig, [MultiViewFrame(0, 0.0, taken), MultiViewFrame(1, 1 / 30, darker)], name="take")
 
 
-def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
-    made = undistort(source, source.cameras)
+def test_a_capture_of_lenses_becomes_one_of_pinholes(source: MemoryCapture) -> None:
+    made = undistort(source, CAMERAS)
     assert isinstance(made, UndistortedSource)
     assert made.rig.testing == ("cam00",)
     assert (made.name, made.fps, len(made)) == ("take", 30.0, 2)
@@ -184,13 +161,12 @@ def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
     assert [frame.index for frame in made.frames(1)] == [1]
 
 
-def test_a_capture_of_pinholes_is_left_alone(source: Filmed) -> None:
-    plain = replace(source, cameras={name: replace(own, lens=Pinhole()) for name, own in source.cameras.items()})
-    assert undistort(plain, plain.cameras) is plain
+def test_a_capture_of_pinholes_is_left_alone(source: MemoryCapture) -> None:
+    assert undistort(source, {name: replace(own, lens=Pinhole()) for name, own in CAMERAS.items()}) is source
 
 
-def test_a_smaller_picture_is_resampled_once(source: Filmed) -> None:
-    half = section(resized(undistort(source, source.cameras), 0.5), start=1)
+def test_a_smaller_picture_is_resampled_once(source: MemoryCapture) -> None:
+    half = section(resized(undistort(source, CAMERAS), 0.5), start=1)
     (frame,) = half.frames()
     for name in half.rig:
         camera = half.rig[name]
@@ -199,19 +175,19 @@ def test_a_smaller_picture_is_resampled_once(source: Filmed) -> None:
         assert error.mean() < 1
 
 
-def test_some_of_the_cameras(source: Filmed) -> None:
-    part = select_cameras(undistort(source, source.cameras), ("cam02", "cam03"))
+def test_some_of_the_cameras(source: MemoryCapture) -> None:
+    part = select_cameras(undistort(source, CAMERAS), ("cam02", "cam03"))
     assert [*part.rig] == ["cam02", "cam03"]
-    whole = next(undistort(source, source.cameras).frames())
+    whole = next(undistort(source, CAMERAS).frames())
     for name, image in next(part.frames()).images.items():
         np.testing.assert_array_equal(image, whole.images[name])
 
 
-def test_a_broken_lens_names_its_camera(source: Filmed, tmp_path: Path) -> None:
-    broken = source.cameras["cam02"]
+def test_a_broken_lens_names_its_camera(source: MemoryCapture) -> None:
+    broken = CAMERAS["cam02"]
     K = broken.camera.K.clone()
     K[1, 2] = -10
-    cameras = {**source.cameras, "cam02": replace(broken, camera=replace(broken.camera, K=K))}
+    cameras = {**CAMERAS, "cam02": replace(broken, camera=replace(broken.camera, K=K))}
     with pytest.raises(CalibrationError, match="Camera 'cam02' of take"):
         undistort(source, cameras)
 

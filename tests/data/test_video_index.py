@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from av.codec.context import Flags
 
-from structgstream.data.video import synchronised
+from structgstream.cameras import CameraRig
+from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CaptureError
 from tests.support.captures import Picture, picture, small_rig, write_videos
@@ -58,16 +59,20 @@ def write(
         container.mux(stream.encode())
 
 
+def read(folder: Path, rig: CameraRig = RIG) -> VideoSource:
+    return synchronised(scan_videos({name: folder / f"{name}.mp4" for name in rig}), rig, where=folder)
+
+
 @pytest.mark.parametrize(("turn", "quarters"), [(0, 0), (90, 1), (180, 2), (-90, 3)])
 def test_turned_videos_are_read_as_they_are_shown(tmp_path: Path, turn: int, quarters: int) -> None:
     for name in RIG:
         write(tmp_path / f"{name}.mp4", [corners()] * 5, turn=turn, options={"qp": "0"})
-    tracks = scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG})
     expected = np.rot90(corners(), quarters)  # counterclockwise
     size = expected.shape[1::-1]
-    assert (tracks["cam00"].width, tracks["cam00"].height, tracks["cam00"].quarter_turns) == (*size, quarters)
     rig = RIG.mapped({name: RIG[name].resized(*size) for name in RIG})
-    source = synchronised(tracks, rig, where=tmp_path)
+    source = read(tmp_path, rig)
+    track = source.tracks["cam00"]
+    assert (track.width, track.height, track.quarter_turns) == (*size, quarters)
     for frame in source.frames(2):
         np.testing.assert_allclose(frame.images["cam01"], expected, atol=4)
     half = rig.mapped({name: rig[name].resized(size[0] // 2, size[1] // 2) for name in rig})
@@ -111,10 +116,10 @@ def test_display_p3_is_converted_to_srgb(tmp_path: Path) -> None:
     shown = np.repeat(np.repeat(np.array([coded], np.uint8), 48, axis=0), 16, axis=1)
     for name in RIG:
         write(tmp_path / f"{name}.mp4", [shown] * 2, options={"qp": "0", "x264-params": "colorprim=smpte432"})
-    source = synchronised(scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG}), RIG, where=tmp_path)
-    read = next(source.frames()).images["cam00"][24, 8::16]
-    np.testing.assert_allclose(read, expected, atol=16)  # Near 0 a step of the file is up to 13 steps of sRGB.
-    np.testing.assert_allclose(read[3], 128, atol=2)
+    source = read(tmp_path)
+    shown = next(source.frames()).images["cam00"][24, 8::16]
+    np.testing.assert_allclose(shown, expected, atol=16)  # Near 0 a step of the file is up to 13 steps of sRGB.
+    np.testing.assert_allclose(shown[3], 128, atol=2)
 
 
 def test_the_shape_of_pixels_is_read(tmp_path: Path) -> None:
@@ -128,7 +133,7 @@ def test_ten_bit_hevc_is_read(tmp_path: Path) -> None:
     for name in RIG:
         quiet = {"x265-params": "log-level=none:lossless=1"}
         write(tmp_path / f"{name}.mp4", [corners()] * 5, codec="libx265", pixels="yuv444p10le", options=quiet)
-    source = synchronised(scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG}), RIG, where=tmp_path)
+    source = read(tmp_path)
     for start in (0, 3):
         np.testing.assert_allclose(next(source.frames(start)).images["cam00"], corners(), atol=4)
 
@@ -139,9 +144,8 @@ def test_open_groups_of_hevc_are_sought_exactly(tmp_path: Path) -> None:
     for number, name in enumerate(RIG):
         pictures = [picture(number, index) for index in range(20)]
         write(tmp_path / f"{name}.mp4", pictures, codec="libx265", options={"x265-params": params})
-    tracks = scan_videos({name: tmp_path / f"{name}.mp4" for name in RIG})
-    assert len(tracks["cam00"].keyframes) > 2
-    source = synchronised(tracks, RIG, where=tmp_path)
+    source = read(tmp_path)
+    assert len(source.tracks["cam00"].keyframes) > 2
     whole = [frame.images["cam01"] for frame in source.frames()]
     assert len(whole) == 20
     for start in range(20):

@@ -37,6 +37,17 @@ class Truth:
     def center(self) -> Floats:
         return (-self.R.T @ self.T).astype(np.float64)
 
+    @property
+    def viewmat(self) -> Floats:
+        """World to camera, ``[4, 4]``."""
+        return np.vstack([np.column_stack([self.R, self.T]), [0, 0, 0, 1]])
+
+    @property
+    def opengl_pose(self) -> list[list[float]]:
+        """Camera to world in OpenGL axes, rows of 4x4."""
+        turned = np.column_stack([self.R.T @ np.diag([1, -1, -1]), self.center])
+        return np.vstack([turned, [0, 0, 0, 1]]).tolist()
+
     def pixels(self, points: Floats) -> Floats:
         """What OpenCV projects, in the package's convention."""
         project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
@@ -91,8 +102,6 @@ def write_easymocap(folder: Path, cameras: Sequence[Truth]) -> Path:
 
 def write_multical(folder: Path, cameras: Sequence[Truth]) -> Path:
     """Poses relative to the first camera, as multical has them with a master."""
-    first = np.eye(4)
-    first[:3, :3], first[:3, 3] = cameras[0].R, cameras[0].T
     content: dict[str, Any] = {"cameras": {}, "camera_poses": {}}
     for camera in cameras:
         content["cameras"][camera.name] = {
@@ -101,9 +110,7 @@ def write_multical(folder: Path, cameras: Sequence[Truth]) -> Path:
             "K": camera.K.tolist(),
             "dist": [[value] for value in camera.dist] if camera.fisheye else [list(camera.dist)],
         }
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.R, camera.T
-        relative = pose @ np.linalg.inv(first)
+        relative = camera.viewmat @ np.linalg.inv(cameras[0].viewmat)
         master = camera is cameras[0]
         key = camera.name if master else f"{camera.name}_to_{cameras[0].name}"
         content["camera_poses"][key] = {"R": relative[:3, :3].tolist(), "T": relative[:3, 3].tolist()}
@@ -113,13 +120,10 @@ def write_multical(folder: Path, cameras: Sequence[Truth]) -> Path:
 
 def write_kalibr(folder: Path, cameras: Sequence[Truth]) -> Path:
     lines: list[str] = []
-    before = np.eye(4)
     for number, camera in enumerate(cameras):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.R, camera.T
         lines += [f"cam{number}:", "  cam_overlaps: []", "  camera_model: pinhole"]
         if number:
-            chain = pose @ np.linalg.inv(before)
+            chain = camera.viewmat @ np.linalg.inv(cameras[number - 1].viewmat)
             lines += ["  T_cn_cnm1:", *[f"  - {row}" for row in chain.tolist()]]
         K = camera.K
         lines += [
@@ -129,7 +133,6 @@ def write_kalibr(folder: Path, cameras: Sequence[Truth]) -> Path:
             f"  resolution: [{WIDTH}, {HEIGHT}]",
             f"  rostopic: /cam{number}/image_raw",
         ]
-        before = pose
     (folder / "rig-camchain.yaml").write_text("\n".join(lines) + "\n")
     return folder / "rig-camchain.yaml"
 
@@ -175,8 +178,7 @@ def write_openpose(folder: Path, cameras: Sequence[Truth]) -> Path:
     for camera in cameras:
         dist = np.zeros((8, 1))
         dist[: len(camera.dist), 0] = camera.dist
-        pose = np.column_stack([camera.R, camera.T])
-        body = matrix("CameraMatrix", pose) + matrix("Intrinsics", camera.K) + matrix("Distortion", dist)
+        body = matrix("CameraMatrix", camera.viewmat[:3]) + matrix("Intrinsics", camera.K) + matrix("Distortion", dist)
         text = f'<?xml version="1.0"?>\n<opencv_storage>\n{body}\n</opencv_storage>\n'
         (folder / f"{camera.name}.xml").write_text(text)
     return folder
@@ -224,9 +226,8 @@ def write_transforms(folder: Path, cameras: Sequence[Truth], *, pattern: str = "
     """OpenGL axes, camera to world, the top-left pixel's centre at (0.5, 0.5)."""
     frames = []
     for camera in cameras:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.R.T @ np.diag([1, -1, -1]), camera.center
-        frames.append({"file_path": pattern.replace("NAME", camera.name), "transform_matrix": pose.tolist()})
+        file = pattern.replace("NAME", camera.name)
+        frames.append({"file_path": file, "transform_matrix": camera.opengl_pose})
     camera = cameras[0]
     keys = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
     content = {
@@ -247,7 +248,7 @@ def write_transforms(folder: Path, cameras: Sequence[Truth], *, pattern: str = "
 def write_projections(folder: Path, cameras: Sequence[Truth]) -> Path:
     """As PMVS has them: K [R | t] alone, up to scale, so without lens and size."""
     for camera in cameras:
-        matrix = -3.0 * camera.K @ np.column_stack([camera.R, camera.T])
+        matrix = -3.0 * camera.K @ camera.viewmat[:3]
         rows = "\n".join(" ".join(map(repr, row)) for row in matrix.tolist())
         (folder / f"{camera.name}.txt").write_text(f"CONTOUR\n{rows}\n")
     return folder / f"{cameras[0].name}.txt"

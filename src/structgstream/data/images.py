@@ -416,18 +416,15 @@ def check_one_series(camera: str, files: Iterable[Path]) -> None:
 def _opened(path: Path) -> Iterator["ImageFile | None"]:
     """The picture with its header read; None if Pillow does not read it."""
     try:
-        from PIL import Image, UnidentifiedImageError
+        from PIL import Image
     except ImportError:
         raise MissingExtraError("Pillow", "capture") from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of damaged metadata; what is needed of them is checked where it is read
             picture = Image.open(path)
-    except (UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
-        yield None
-        return
-    except OSError as error:
-        if error.errno is not None:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # what is no picture has no number
             raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
         yield None
         return

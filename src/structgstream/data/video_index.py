@@ -175,7 +175,8 @@ def _scan(path: Path) -> VideoTrack:
         keys = [packet.pts for packet in packets if packet.is_keyframe and packet.pts is not None]
         seconds = float(stream.time_base)
         if not started:  # Some recorders mark no key frame, or write none.
-            first = _first_of(path)
+            with open_video(path) as again:
+                first = _first(lambda: again.decode(video_stream(again)))
         start = stamps[0] if stamps else 0
         origin = start - (packets[0].dts or 0) if container.format.name == "avi" else 0
         stamps = _decodable(path, stamps, first, seconds)
@@ -220,12 +221,6 @@ def _report_other_streams(path: Path, container: "InputContainer", taken: "Video
             "to a file of its own",
             path, len(alike), *size, ", ".join(map(str, alike)), taken.index,
         )  # fmt: skip
-
-
-def _first_of(path: Path) -> "VideoFrame | None":
-    """The first frame that a file gives."""
-    with open_video(path) as container:
-        return _first(lambda: container.decode(video_stream(container)))
 
 
 def _first(decode: Callable[[], Iterable[Any]]) -> Any:
