@@ -74,7 +74,6 @@ def test_what_differs_is_the_data() -> None:
         "paper-immersive": (1280, 960, 46),
     }
     assert [data.held_out for data in PAPER_DATA.values()] == [None, 1, 1]
-    assert [data.undistorted for data in PAPER_DATA.values()] == [False, False, True]
 
 
 def test_what_published_loaders_do_where_the_paper_is_silent() -> None:

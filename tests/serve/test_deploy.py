@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files in ``deploy/``: the server behind nginx and Caddy, what describes containers, and the units."""
 
-import getpass
 import gzip
-import os
 import re
 import shutil
-import socket
 import subprocess
 import time
 import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -26,7 +23,7 @@ from structgstream.serve.access import TokenKeys
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.listening import LOOPBACK_NAMES
 from tests.support.segment_folders import GrowingFolder
-from tests.support.serving import Served, hosted
+from tests.support.serving import Served, free_port, hosted, nginx, started
 from tests.support.streams import small_stream
 from tests.support.waiting import wait_until
 
@@ -36,35 +33,8 @@ STREAM = small_stream(7)
 PATIENCE_SECONDS = 30.0
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
 @contextmanager
-def started(command: list[str], port: int, folder: Path, **environment: str) -> Iterator[Served]:
-    """A proxy in a process of its own, which listens on a port of the loopback address."""
-    with (folder / "stderr").open("wb") as stderr:
-        process = subprocess.Popen(command, env={**os.environ, **environment}, stderr=stderr)
-
-    def is_up() -> bool:
-        assert process.poll() is None, command
-        with suppress(OSError):
-            socket.create_connection(("127.0.0.1", port), 1).close()
-            return True
-        return False
-
-    try:
-        wait_until(is_up, seconds=PATIENCE_SECONDS)
-        yield Served(port)
-    finally:
-        process.terminate()
-        process.wait(PATIENCE_SECONDS)
-
-
-@contextmanager
-def nginx(folder: Path, upstream: int) -> Iterator[Served]:
+def deployed_nginx(folder: Path, upstream: int) -> Iterator[Served]:
     """``deploy/nginx.conf`` with other places, and without TLS."""
     port = free_port()
     site = (DEPLOY / "nginx.conf").read_text()
@@ -77,13 +47,7 @@ def nginx(folder: Path, upstream: int) -> Iterator[Served]:
         assert site.count(written) == 1, written
         site = site.replace(written, here)
     site = re.sub(r"ssl_certificate\w* [^;]+;", "", site)
-    user = f"user {getpass.getuser()};" if os.geteuid() == 0 else ""
-    places = "".join(
-        f"{kind}_temp_path {folder}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    )
-    whole = f"{user} daemon off; pid {folder}/pid; events {{}} http {{ {places}\n{site} }}"
-    (folder / "nginx.conf").write_text(whole)
-    with started(["nginx", "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors")], port, folder) as running:
+    with nginx(folder, port, site) as running:
         yield running
 
 
@@ -103,7 +67,7 @@ def caddy(folder: Path, upstream: int) -> Iterator[Served]:
         yield running
 
 
-PROXIES = {"nginx": nginx, "caddy": caddy}
+PROXIES = {"nginx": deployed_nginx, "caddy": caddy}
 
 
 @pytest.fixture(params=sorted(PROXIES))

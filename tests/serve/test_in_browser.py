@@ -5,16 +5,12 @@ The player itself is tested in ``viewer/packages``.
 """
 
 import base64
-import getpass
-import os
 import re
 import shutil
-import socket
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -27,7 +23,7 @@ from numpy.typing import NDArray
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
+from structgstream.codec.sinks import MemorySink, resume_segments
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
@@ -45,7 +41,7 @@ from tests.support.pictures import decoded_picture
 from tests.support.plain import some
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.segment_folders import GrowingFolder
-from tests.support.serving import hosted, served
+from tests.support.serving import free_port, hosted, nginx, served
 from tests.support.streams import compact_header, moved, write_stream
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -55,12 +51,18 @@ PLAYER = 'document.querySelector("structgstream-player")'
 SHOWN = f"{PLAYER}?.stats?.settled"
 
 
+def made_stream(seed: int = 4) -> bytes:
+    """Some hundred splats that move, a key packet at every third frame."""
+    sink = MemorySink()
+    scenes = [moved(random_scene(60, seed=seed), step) for step in range(FRAMES)]
+    write_stream(sink, scenes, header=compact_header(scenes[0]))
+    return sink.data
+
+
 @pytest.fixture(scope="module")
 def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some hundred splats that move, a key packet at every third frame."""
     path = tmp_path_factory.mktemp("stream") / "small.sgs"
-    scenes = [moved(random_scene(60, seed=4), step) for step in range(FRAMES)]
-    write_stream(FileSink(path), scenes, header=compact_header(scenes[0]))
+    path.write_bytes(made_stream())
     return path
 
 
@@ -83,20 +85,17 @@ def paused_at(tab: Tab, frame: int) -> None:
     tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {frame}")
 
 
-def decibels(picture: NDArray[np.uint8], stream: Path, frame: int) -> float:
-    """How near a picture is to what Python renders for the first training camera."""
+def check_picture(tab: Tab, stream: Path, frame: int, *, whole_page: bool = False) -> None:
+    """Looks at the frame that is shown through the first training camera; Python renders the same."""
+    tab.evaluate(f"{PLAYER}.show({PLAYER}.cameras[1]), new Promise(requestAnimationFrame)")
+    tab.wait_for(SHOWN)
+    picture = tab.screenshot() if whole_page else canvas_of(tab)
     reader = open_stream(stream)
     camera = reader.header.camera(reader.header.rig.training[0])
     wanted, _ = rendered(reader.scene(frame), camera.resized(WIDTH, HEIGHT), reference_backend())
     assert picture.shape == wanted.shape
-    assert wanted.std() > 20  # something is there to be seen
-    return 10 * np.log10(255**2 / float(np.square(picture.astype(float) - wanted).mean()))
-
-
-def looked_through_first(tab: Tab) -> None:
-    """Looks through the first training camera, and waits for the picture."""
-    tab.evaluate(f"{PLAYER}.show({PLAYER}.cameras[1]), new Promise(requestAnimationFrame)")
-    tab.wait_for(SHOWN)
+    assert wanted.std() > 20, "something is there to be seen"
+    assert 10 * np.log10(255**2 / float(np.square(picture.astype(float) - wanted).mean())) > 40
 
 
 def canvas_of(tab: Tab) -> NDArray[np.uint8]:
@@ -116,8 +115,7 @@ def test_a_page_opens_from_the_disk(tab: Tab, stream: Path, tmp_path: Path) -> N
     write_page(page, StreamFile(stream))
     tab.open(page.as_uri(), width=WIDTH, height=HEIGHT)
     paused_at(tab, 4)
-    looked_through_first(tab)
-    assert decibels(tab.screenshot(), stream, 4) > 40
+    check_picture(tab, stream, 4, whole_page=True)
     assert tab.evaluate(f"{PLAYER}.duration") == pytest.approx(FRAMES / 30)
     assert not tab.complaints
     assert {address.split(":")[0] for address in tab.requests} <= {"file", "blob", "data"}
@@ -133,8 +131,7 @@ def test_an_imported_sequence_plays(tab: Tab, tmp_path: Path) -> None:
     tab.open(page.as_uri(), width=WIDTH, height=HEIGHT)
     for frame in (2, 0):
         paused_at(tab, frame)
-        looked_through_first(tab)
-        assert decibels(tab.screenshot(), stream, frame) > 40
+        check_picture(tab, stream, frame, whole_page=True)
     assert not tab.complaints
 
 
@@ -150,8 +147,7 @@ def test_the_server_plays_and_compares_and_follows(tab: Tab, stream: Path, tmp_p
         growing.write_bytes(whole)
         tab.wait_for(f"{PLAYER}.stats.frameIndex > 1")
         paused_at(tab, 5)
-        looked_through_first(tab)
-        assert decibels(canvas_of(tab), stream, 5) > 40
+        check_picture(tab, stream, 5)
         assert not tab.complaints
         assert all(address.startswith((server.address, "blob:", "data:")) for address in tab.requests)
         assert f"{server.address}truth.json" in tab.requests
@@ -163,8 +159,7 @@ def test_a_site_plays_from_a_server_that_knows_nothing(tab: Tab, stream: Path, t
     with python_host(site) as address:
         tab.open(address, width=WIDTH, height=HEIGHT)
         paused_at(tab, 3)
-        looked_through_first(tab)
-        assert decibels(canvas_of(tab), stream, 3) > 40
+        check_picture(tab, stream, 3)
     assert not tab.complaints
 
 
@@ -187,36 +182,15 @@ def python_host(root: Path) -> Iterator[str]:
 
 
 @contextmanager
-def nginx(root: Path) -> Iterator[str]:
+def documented_nginx(root: Path) -> Iterator[str]:
     """nginx with the configuration of docs/segments.md."""
-    program = shutil.which("nginx")
-    assert program is not None
-    work = root.parent / "nginx"
-    work.mkdir()
+    (work := root.parent / "nginx").mkdir()
     documented = (DOCS / "segments.md").read_text().split("```nginx\n")[1].split("```")[0]
     site = documented.replace("root /srv;", f"root {root};")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    user = f"user {getpass.getuser()};" if os.geteuid() == 0 else ""
-    places = "".join(
-        f"{kind}_temp_path {work}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    )
     page = f"location / {{ root {root}; types {{ text/html html; text/javascript js; }} }}"
-    (work / "nginx.conf").write_text(
-        f"{user} daemon off; pid {work}/pid; events {{}} http {{ access_log off; {places} "
-        f"server {{ listen 127.0.0.1:{port}; {page}\n{site} }} }}"
-    )
-    running = subprocess.Popen([program, "-c", str(work / "nginx.conf"), "-e", str(work / "errors")])
-    try:
-        while running.poll() is None:
-            with suppress(OSError):
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            time.sleep(0.05)
-        yield f"http://127.0.0.1:{port}/"
-    finally:
-        running.terminate()
-        running.wait(20)
+    port = free_port()
+    with nginx(work, port, f"access_log off; server {{ listen 127.0.0.1:{port}; {page}\n{site} }}") as running:
+        yield running.address
 
 
 def test_segments_play_from_a_host_of_files_while_they_are_written(tab: Tab, stream: Path, tmp_path: Path) -> None:
@@ -231,7 +205,7 @@ def test_segments_play_from_a_host_of_files_while_they_are_written(tab: Tab, str
     page = linked_page("live", stream="streams/live/manifest.json", attributes={"autoplay": ""})
     (root / "index.html").write_text(page)
     (root / "player.js").write_text(bundle(), encoding="utf-8")
-    with (nginx if shutil.which("nginx") else python_host)(root) as address:
+    with (documented_nginx if shutil.which("nginx") else python_host)(root) as address:
         tab.open(f"{address}index.html", width=WIDTH, height=HEIGHT)
         tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1 && {PLAYER}.live")
         for packet in packets[2:4]:  # the first of them is a key, so that a segment is closed
@@ -245,8 +219,7 @@ def test_segments_play_from_a_host_of_files_while_they_are_written(tab: Tab, str
             again.write(packet)
         tab.wait_for(f"{SHOWN} && {PLAYER}.live && {PLAYER}.stats.frameIndex === {FRAMES - 1}")
         again.close()
-        looked_through_first(tab)
-        assert decibels(canvas_of(tab), stream, FRAMES - 1) > 40
+        check_picture(tab, stream, FRAMES - 1)
     assert not tab.complaints
 
 
@@ -285,8 +258,7 @@ def test_the_widget_shows_a_stream_and_another_and_goes(tab: Tab, stream: Path, 
         }})()"""
     )
     paused_at(tab, 2)
-    looked_through_first(tab)
-    assert decibels(canvas_of(tab), stream, 2) > 40
+    check_picture(tab, stream, 2)
     tab.evaluate(f"{PLAYER}.seek(0), listeners.get('change:stream')(), 1")
     tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 0")
     tab.evaluate("values.height_pixels = 100, listeners.get('change:height_pixels')(), 1")
@@ -305,13 +277,10 @@ def answered(metrics: str, kind: str, stream: str) -> bool:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    sink = MemorySink()
-    scenes = [moved(random_scene(60, seed=4), step) for step in range(6)]
-    write_stream(sink, scenes, header=compact_header(scenes[0]))
+def folder(tmp_path: Path, stream: Path) -> Path:
     streams = tmp_path / "streams"
-    GrowingFolder(streams / "studio", sink.data).write()
-    (streams / "ball.sgs").write_bytes(sink.data)
+    GrowingFolder(streams / "studio", stream.read_bytes()).write()
+    (streams / "ball.sgs").write_bytes(stream.read_bytes())
     for path in (streams / "studio" / "preview.png", streams / "ball.preview.png"):
         path.write_bytes(png_bytes(np.full((6, 8, 3), 200, np.uint8)))
     return streams
@@ -341,10 +310,7 @@ def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: P
     """By hand, in the panel, with a token of that stream alone; these two qualities show different scenes."""
     folder = tmp_path / "streams"
     for name, seed in (("low", 4), ("high", 9)):
-        sink = MemorySink()
-        scenes = [moved(random_scene(60, seed=seed), step) for step in range(6)]
-        write_stream(sink, scenes, header=compact_header(scenes[0]))
-        GrowingFolder(folder / "show" / name, sink.data).write_all()
+        GrowingFolder(folder / "show" / name, made_stream(seed)).write_all()
     listed = [ListedQuality(name, f"{name}/manifest.json", bits) for name, bits in (("low", 1e6), ("high", 1e12))]
     write_list(folder / "show", listed)
     panel = f"{PLAYER}.shadowRoot.querySelector('[aria-label^=Picture]')"
@@ -354,9 +320,7 @@ def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: P
 
     def shown(frame: int) -> np.ndarray:
         """What a frame looks like."""
-        hidden = f"{PLAYER}.setAttribute('controls', 'off')"
-        tab.evaluate(f"{PLAYER}.pause(), {hidden}, {PLAYER}.seek({frame + 0.5} / 30), 1")
-        tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {frame}")
+        paused_at(tab, frame)
         return tab.screenshot().astype(float)
 
     def numbers() -> str:

@@ -159,11 +159,6 @@ def test_what_was_asked_for_is_not_decoded_again(source: FrameSource) -> None:
     assert truth.jpeg("cam00", 3) is truth.jpeg("cam00", 3)
 
 
-def test_nobody_and_never(source: FrameSource) -> None:
-    truth = Truth(source, ("cam00",))
-    assert [truth.jpeg(camera, frame) for camera, frame in [("cam01", 0), ("cam00", 12), ("cam00", -1)]] == [None] * 3
-
-
 def test_a_video_that_breaks_is_reported_and_asked_again(tmp_path: Path) -> None:
     folder = tmp_path / "clip"
     shutil.copytree(bundled_clip_path(), folder)

@@ -75,19 +75,6 @@ def test_the_folder_itself_may_be_a_link(tmp_path: Path) -> None:
         assert opened[:] == b"x"
 
 
-def test_files_beside_a_stream_are_named_after_it(tmp_path: Path) -> None:
-    (tmp_path / "ball.sgs").touch()
-    (tmp_path / "studio").mkdir()
-    (tmp_path / "studio" / "manifest.json").touch()
-    for name in ("ball", "studio"):
-        (tmp_path / f"{name}.metrics.json").write_text(name)
-    for name, stream in Catalog(tmp_path).found().items():
-        opened = stream.open_beside(".metrics.json")
-        assert opened is not None
-        with opened:
-            assert opened[:].decode() == name.removesuffix(".sgs")
-
-
 def several(folder: Path, *names: str, listed: tuple[str, ...] | None = None) -> None:
     """A folder of several qualities, of which the last one listed takes the least."""
     for name in names:

@@ -26,7 +26,7 @@ from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.memory_captures import MemoryCapture
-from tests.support.sessions import resume_in
+from tests.support.sessions import resume_in, run_session
 from tests.support.small_presets import TINY_RIG
 from tests.support.streams import moved, same, small_scene
 from tests.support.worlds import moving_world
@@ -61,11 +61,8 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
-def run(
-    source: MemoryCapture, sink, *, resumed=None, config: StreamConfig = TINY_RIG, metadata=None
-) -> list[FrameReport]:
-    pipeline = stream_pipeline(config)
-    return list(Session(source, sink, pipeline, reference_backend(), resumed=resumed, metadata=metadata).run())
+def run(source: MemoryCapture, sink, *, config: StreamConfig = TINY_RIG, **options: Any) -> list[FrameReport]:
+    return run_session(source, sink, config, **options)
 
 
 def uninterrupted(frames: int = 5, config: StreamConfig = TINY_RIG) -> bytes:

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The real servers in a thread, for tests that talk to them through a socket."""
+"""The real servers in a thread, and proxies in a process, for tests that talk to them through a socket."""
 
+import getpass
 import http.client
 import json
+import os
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -16,6 +20,7 @@ import uvicorn
 from structgstream.serve import app, play
 from structgstream.serve.listening import bound, server
 from structgstream.serve.pages import StreamFile
+from tests.support.waiting import wait_until
 
 
 @dataclass(frozen=True)
@@ -87,3 +92,41 @@ def served(stream: StreamFile, *, truth: play.Truth | None = None) -> Iterator[S
     """The server of ``structgstream play`` on a free port."""
     with running(server(play.application(stream, truth=truth)), bound(0)) as found:
         yield found
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return found.getsockname()[1]
+
+
+@contextmanager
+def started(command: list[str], port: int, folder: Path, **environment: str) -> Iterator[Served]:
+    """A server in a process of its own, which listens on a port of the loopback address."""
+    with (folder / "stderr").open("wb") as stderr:
+        process = subprocess.Popen(command, env={**os.environ, **environment}, stderr=stderr)
+
+    def is_up() -> bool:
+        assert process.poll() is None, command
+        with suppress(OSError):
+            socket.create_connection(("127.0.0.1", port), 1).close()
+            return True
+        return False
+
+    try:
+        wait_until(is_up, seconds=30.0)
+        yield Served(port)
+    finally:
+        process.terminate()
+        process.wait(30.0)
+
+
+@contextmanager
+def nginx(folder: Path, port: int, site: str) -> Iterator[Served]:
+    """nginx with what its block ``http`` has; its own files are in ``folder``."""
+    user = f"user {getpass.getuser()};" if os.geteuid() == 0 else ""
+    places = "".join(
+        f"{kind}_temp_path {folder}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    (folder / "nginx.conf").write_text(f"{user} daemon off; pid {folder}/pid; events {{}} http {{ {places}\n{site} }}")
+    with started(["nginx", "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors")], port, folder) as running:
+        yield running

@@ -162,7 +162,7 @@ class Session(Generic[State, Memory]):
             check_enough_pictures(frame, self._rig, self._source.name)
             pictures = method.observe(frame, before, rig=self._rig, backend=self._backend)
             yield frame, pictures
-            if method.needs_before and (frame.index == 0 or shows_enough(frame, self._rig)):
+            if method.needs_before and shows_enough(frame, self._rig):
                 before = pictures.views
 
     def _showing_from(self, frame: MultiViewFrame) -> MultiViewFrame:
@@ -277,7 +277,7 @@ class Session(Generic[State, Memory]):
     def _measure(self, state: State, task: FrameTask) -> None:
         """Add the residual of a decoded frame to the plan of periods, if the plan needs it."""
         index = task.frame.index
-        if self._pipeline.residual is None or (index > 0 and not shows_enough(task.frame, self._rig)):
+        if self._pipeline.residual is None or not shows_enough(task.frame, self._rig):
             return
         if self._plan.measures(index, task.frame.pts_seconds, self._keys):
             self._plan.add(index, self._pipeline.residual(state, task))

@@ -231,15 +231,12 @@ class PaperData:
     held_out: int | None  # number of held-out cameras; None if the paper does not state it
     held_out_camera: str  # the camera that published results hold out
     scale: float = 1.0  # of the pictures relative to the stored ones; --scale of reconstruct
-    undistorted: bool = False  # whether fisheye pictures were undistorted first
 
 
 PAPER_DATA: Mapping[str, PaperData] = {
     "paper-n3dv": PaperData(1352, 1014, cameras=21, held_out=None, held_out_camera="cam00", scale=0.5),
     "paper-meetroom": PaperData(1280, 720, cameras=13, held_out=1, held_out_camera="cam_0"),
-    "paper-immersive": PaperData(
-        1280, 960, cameras=46, held_out=1, held_out_camera="camera_0001", scale=0.5, undistorted=True
-    ),
+    "paper-immersive": PaperData(1280, 960, cameras=46, held_out=1, held_out_camera="camera_0001", scale=0.5),
 }
 """By the preset named after the data set. They are properties of the capture, so they are not in the configuration."""
 

@@ -32,7 +32,7 @@ from tests.support.waiting import wait_until
 
 WAIT = 20.0
 PERIOD = 1 / 30
-NOWHERE = LiveCamera("udp://nowhere")
+NOWHERE = LiveCamera("udp://user:secret@nowhere")
 
 
 class Received:

@@ -86,10 +86,6 @@ def test_a_description_of_a_session_is_beside_the_rig_file_and_no_recording(tmp_
     assert not LiveCamera("http://studio/a.sdp").is_session
 
 
-def test_a_password_is_in_no_message() -> None:
-    assert LiveCamera("rtsp://user:secret@10.0.0.11/stream").shown_url == "rtsp://10.0.0.11/stream"
-
-
 def test_little_is_needed(tmp_path: Path) -> None:
     rig = read_rig(written(tmp_path, 'calibration = "/calibrated"\n[cameras.a]\nurl = "/dev/video0"\nformat = "v4l2"'))
     assert (rig.name, rig.calibration, rig.clock) == ("rig", Path("/calibrated"), TimeBase.ARRIVAL)
