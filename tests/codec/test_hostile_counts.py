@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
+from structgstream.codec.container.blocks import BLOCK, first_block, iterate_blocks, unpack_blocks
 from structgstream.codec.entropy import rans
 from structgstream.codec.entropy.bits import varint
 from structgstream.codec.entropy.rans import SectionDecoder
@@ -97,8 +97,7 @@ def check_all_refused(fields: Fields, counts: list[Count], decode: Callable[[Fie
 def test_counts_in_the_init_record() -> None:
     header = header_with_all()
     payload = pack_header(header)
-    (length,) = LENGTH.unpack_from(payload)
-    coded = unpack_blocks(payload, LENGTH.size + length, where="")[1]
+    coded = unpack_blocks(payload, first_block(payload), where="")[1]
     fields: Fields = {name: bytes(data) for name, data in coded.items()}
 
     def decode(given: Fields) -> object:
@@ -112,9 +111,8 @@ def test_counts_in_the_init_record() -> None:
 
 def test_sizes_in_blocks() -> None:
     payload = pack_header(header_with_all())
-    (length,) = LENGTH.unpack_from(payload)
     tracemalloc.start()
-    for block in iterate_blocks(payload, LENGTH.size + length, where=""):
+    for block in iterate_blocks(payload, first_block(payload), where=""):
         for place in range(block.start + BLOCK.size, block.data, 4):
             for value in HUGE:
                 tracemalloc.reset_peak()

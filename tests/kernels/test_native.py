@@ -15,6 +15,8 @@ from structgstream.kernels.cuda_library import CUDA_PROTOTYPES
 from structgstream.kernels.native import PROTOTYPES, TYPES, native_library
 from tests.support.backends import needs_native
 
+SOURCES = Path(__file__).parents[2] / "csrc"
+
 
 @pytest.fixture(autouse=True)
 def fresh() -> Iterator[None]:
@@ -60,8 +62,7 @@ def test_a_library_of_another_version_is_refused(
 
 def test_the_version_rises_with_the_interface() -> None:
     """When this fails the interface has changed: raise SGS_ABI_VERSION and ABI_VERSION, and note the new hash here."""
-    sources = Path(__file__).parents[2] / "csrc"
-    text = b"".join((sources / name).read_bytes() for name in ("include/structgstream.h", "cpu/anchors.h"))
+    text = b"".join((SOURCES / name).read_bytes() for name in ("include/structgstream.h", "cpu/anchors.h"))
     code = re.sub(rb"\s+", b" ", re.sub(rb"//[^\n]*|/\*.*?\*/", b"", text, flags=re.DOTALL))  # Comments may change.
     noted = {11: "7c5f03bffe9859a2e8b7cfe750bd9b5eb328951b6c6238e54c0db2fe5a3338cd"}
     assert f"#define SGS_ABI_VERSION {native.ABI_VERSION}\n".encode() in text
@@ -73,7 +74,6 @@ def test_the_instruction_set_has_a_name() -> None:
         assert native.instruction_set() in native.ISA_NAMES
 
 
-SOURCES = Path(__file__).parents[2] / "csrc"
 HEADERS = {"structgstream.h": PROTOTYPES, "cuda": CUDA_PROTOTYPES}
 FILES = {
     "structgstream.h": ["include/structgstream.h"],

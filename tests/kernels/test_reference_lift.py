@@ -33,6 +33,11 @@ def projected(points: torch.Tensor) -> torch.Tensor:
     return pixels[..., :2] / pixels[..., 2:]
 
 
+def flow_of(motion: torch.Tensor) -> torch.Tensor:
+    """Flow ``[V, E, 2]`` of all points under one displacement, linearised as ``lift`` has it."""
+    return projection_jacobians(centers(), *cameras()) @ motion
+
+
 def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torch.Tensor | None = None):
     viewmats, Ks, near = cameras()
     return lift(
@@ -45,10 +50,9 @@ def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torc
 
 
 def test_the_jacobian_is_that_of_the_projection() -> None:
-    viewmats, Ks, near = cameras()
     points = centers()[:4]
     step = 1e-6
-    found = projection_jacobians(points, viewmats, Ks, near)
+    found = projection_jacobians(points, *cameras())
     for axis in range(3):
         shift = torch.zeros(3, dtype=torch.float64)
         shift[axis] = step
@@ -57,9 +61,7 @@ def test_the_jacobian_is_that_of_the_projection() -> None:
 
 
 def test_flow_of_a_known_motion_gives_the_motion() -> None:
-    viewmats, Ks, near = cameras()
-    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
-    found = lifted(flows)
+    found = lifted(flow_of(MOTION))
     # The pull towards no motion is two per cent of the flow's.
     torch.testing.assert_close(found.displacements, MOTION.expand(MOVERS, 3), atol=2e-3, rtol=0.1)
     assert (found.inlier_share > 0.99).all()
@@ -67,8 +69,7 @@ def test_flow_of_a_known_motion_gives_the_motion() -> None:
 
 
 def test_a_view_whose_flow_is_wrong_is_outvoted() -> None:
-    viewmats, Ks, near = cameras()
-    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
+    flows = flow_of(MOTION)
     flows[2] += 12.0
     found = lifted(flows)
     torch.testing.assert_close(found.displacements, MOTION.expand(MOVERS, 3), atol=3e-3, rtol=0.1)
@@ -106,8 +107,7 @@ def test_a_turning_ball_that_moves_by_40_pixels_is_lifted_whole(monkeypatch) -> 
 
 
 def test_where_nothing_moves_fast_an_error_of_three_pixels_is_outvoted() -> None:
-    viewmats, Ks, near = cameras()
-    flows = projection_jacobians(centers(), viewmats, Ks, near) @ (0.3 * MOTION)
+    flows = flow_of(0.3 * MOTION)
     flows[2] += torch.tensor([3.0, 0.0])
     assert (lifted(flows).agreeing_views == VIEWS - 1).all()
 
@@ -120,11 +120,10 @@ def test_without_flow_the_prior_holds() -> None:
 
 
 def test_one_view_leaves_depth_to_the_prior() -> None:
-    viewmats, Ks, near = cameras()
-    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
+    viewmats, _, _ = cameras()
     weights = torch.zeros(VIEWS, MOVERS, dtype=torch.float64)
     weights[0] = 5.0
-    found = lifted(flows, weights)
+    found = lifted(flow_of(MOTION), weights)
     along = torch.nn.functional.normalize(centers() - torch.linalg.inv(viewmats[0])[:3, 3], dim=1)
     assert ((found.displacements * along).sum(1).abs() < 0.002).all()
     assert (found.agreeing_views == 1).all()

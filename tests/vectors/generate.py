@@ -254,16 +254,22 @@ def streamed(
     return sink.data
 
 
+def plain_fields(scene: Scene) -> dict[str, Any]:
+    """A scene as plain values: tensors as shape and flat list, in the order of the state table."""
+    return {
+        name: {"shape": list(value.shape), "values": value.flatten().tolist()}
+        for name, value in state_of(scene).items()
+    }
+
+
 def reported(scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> dict[str, Any]:
-    """What is in a stream, as plain values: tensors as shape and flat list, in the order of the state table."""
-    frames = []
-    for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True)):
-        fields = {
-            name: {"shape": list(value.shape), "values": value.flatten().tolist()}
-            for name, value in state_of(scene).items()
-        }
-        frames.append({"index": index, "pts_seconds": index / 4, "kind": kind.name, "fields": fields})
-    return {"frames": frames}
+    """What is in a stream, as plain values."""
+    return {
+        "frames": [
+            {"index": index, "pts_seconds": index / 4, "kind": kind.name, "fields": plain_fields(scene)}
+            for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True))
+        ]
+    }
 
 
 def golden_stream() -> bytes:

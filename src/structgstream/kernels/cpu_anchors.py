@@ -21,10 +21,13 @@ class _Head(ctypes.Structure):
     _fields_ = members(ctypes.c_void_p, "w1 b1 w2 b2")
 
 
+Heads = _Head * 3
+
+
 class _Anchors(ctypes.Structure):
     _fields_ = [
         *members(ctypes.c_void_p, "positions log_offset_scales log_base_scales offsets features visible"),
-        ("heads", _Head * 3),
+        ("heads", Heads),
         ("camera_center", ctypes.c_float * 3),
         *members(ctypes.c_int32, "visible_count offsets_per_anchor feature_size hidden_size distance_input"),
     ]
@@ -49,11 +52,8 @@ class _AnchorGradients(ctypes.Structure):
     _fields_ = [
         ("anchors", ctypes.c_int64),
         *members(ctypes.c_void_p, "positions log_offset_scales log_base_scales offsets features"),
-        ("heads", _Head * 3),
+        ("heads", Heads),
     ]
-
-
-Heads = _Head * 3
 
 
 def native_heads(weights: Sequence[Tensor | None]) -> Any:

@@ -185,31 +185,25 @@ def test_few_bytes_do_not_make_many_numbers() -> None:
 
 
 def test_offsets_and_directions_that_do_not_fit() -> None:
-    fields = fields_of()
-    coded = encode_fields(fields, STEPS)
+    coded = encode_fields(fields_of(), STEPS)
     with pytest.raises(StreamError, match="damaged|not fit"):
         decode_fields({**coded, "anchor_offsets": coded["anchor_features"]}, STEPS)
-    one: dict[FieldName, torch.Tensor] = {**fields, "appearance_basis": fields["appearance_basis"][:1]}
     with pytest.raises(StreamError, match=r"holds 2 numbers of appearance_basis, which do not fit \(2, 2\)"):
-        decode_fields(_unchecked(one), STEPS)
+        decode_fields({**coded, "appearance_basis": numbers_alone("appearance_basis", 2)}, STEPS)
 
 
 def test_an_environment_of_no_whole_rows() -> None:
-    alone = SectionEncoder()
-    alone.number("environment.count", 4)
-    alone.naturals("environment.value", np.arange(4), np.zeros(4, np.uint16), count=1)
+    coded = encode_fields(fields_of(), STEPS)
     with pytest.raises(StreamError, match=r"holds 4 numbers of environment, which do not fit \(1, 3\)"):
-        decode_fields({**encode_fields(fields_of(), STEPS), "environment": alone.fields["environment"]}, STEPS)
+        decode_fields({**coded, "environment": numbers_alone("environment", 4)}, STEPS)
 
 
-def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:
-    whole = encode_fields(fields_of(), STEPS)
-    alone = SectionEncoder()
-    bins = np.rint(fields["appearance_basis"].numpy().ravel() / STEPS["appearance_basis"]).astype(np.int64)
-    alone.number("appearance_basis.count", len(bins))
-    values = np.where(bins < 0, -2 * bins - 1, 2 * bins)
-    alone.naturals("appearance_basis.value", values, np.zeros(len(bins), np.uint16), count=1)
-    return {**whole, "appearance_basis": alone.fields["appearance_basis"]}
+def numbers_alone(name: str, count: int) -> bytes:
+    """A field of so many numbers, whether or not they fit the other fields."""
+    encoder = SectionEncoder()
+    encoder.number(f"{name}.count", count)
+    encoder.naturals(f"{name}.value", np.arange(count), np.zeros(count, np.uint16), count=1)
+    return encoder.fields[name]
 
 
 @examples(100)

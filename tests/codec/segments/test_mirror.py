@@ -57,6 +57,29 @@ class Remote(FolderStore):
             raise StorageError("No route to host.")
 
 
+@pytest.fixture
+def here(tmp_path: Path) -> FolderStore:
+    return folder(tmp_path / "here")
+
+
+@pytest.fixture
+def remote(tmp_path: Path) -> Remote:
+    return Remote(tmp_path / "remote")
+
+
+def held_up(remote: Remote) -> tuple[threading.Event, threading.Event]:
+    """Makes copying wait; the first event is set when it does, the second one lets it go on."""
+    inside, done = threading.Event(), threading.Event()
+
+    def before(name: str) -> None:
+        if name != MARKER:
+            inside.set()
+            assert done.wait(60)
+
+    remote.before = before
+    return inside, done
+
+
 def named(store: Store) -> dict[str, bytes]:
     """What the manifest names, and itself."""
     there = store.names()
@@ -68,8 +91,7 @@ def check_copied(mirror: MirroredStore) -> None:
     assert named(mirror._remote) == named(mirror._folder)
 
 
-def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_everything_is_copied_and_every_manifest_is_whole(here: FolderStore, remote: Remote) -> None:
     written(mirror := MirroredStore(here, remote), SENT)
     check_copied(mirror)
     assert remote.edges == sorted(remote.edges)
@@ -78,8 +100,7 @@ def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> Non
     assert stored[: len(stored)] == as_file(SENT)
 
 
-def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(here: FolderStore, remote: Remote) -> None:
     reported: list[str] = []
     remote.reachable.clear()
     mirror = MirroredStore(here, remote, options=MirrorOptions(report=reported.append))
@@ -96,8 +117,7 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     assert "can be reached again" in reported[1]
 
 
-def test_what_was_not_copied_is_reported_and_copied_by_the_next_run(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_what_was_not_copied_is_reported_and_copied_by_the_next_run(here: FolderStore, remote: Remote) -> None:
     remote.reachable.clear()
     written(mirror := MirroredStore(here, remote), SENT)
     assert mirror.finish(wait_seconds=0.0) > 0
@@ -141,8 +161,7 @@ def contents(store: FolderStore) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in store.folder.iterdir()}
 
 
-def test_a_copy_without_a_marker_is_known_by_its_first_record(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_a_copy_without_a_marker_is_known_by_its_first_record(here: FolderStore, remote: Remote) -> None:
     written(mirror := MirroredStore(here, remote), SENT)
     assert mirror.finish(wait_seconds=60) == 0
     for store in (here, remote):
@@ -151,9 +170,10 @@ def test_a_copy_without_a_marker_is_known_by_its_first_record(tmp_path: Path) ->
     assert (here.folder / MARKER).read_bytes() == (remote.folder / MARKER).read_bytes()
 
 
-def test_a_file_that_leaves_the_folder_leaves_the_other_store_after_its_grace(tmp_path: Path) -> None:
+def test_a_file_that_leaves_the_folder_leaves_the_other_store_after_its_grace(
+    here: FolderStore, remote: Remote
+) -> None:
     hands = Hands()
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     options = MirrorOptions(grace_seconds=5.0, elapsed=lambda: hands.elapsed)
     mirror = MirroredStore(here, remote, options=options)
     kept = SegmentsOptions(grace_seconds=0.5)
@@ -172,10 +192,11 @@ def _settle(mirror: MirroredStore) -> None:
         assert mirror._changed.wait_for(lambda: not mirror._pending(), timeout=60)
 
 
-def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(tmp_path: Path) -> None:
+def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(
+    here: FolderStore, remote: Remote
+) -> None:
     """The outage is longer than the time of grace."""
     hands = Hands()
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     remote.reachable.clear()
     mirror = MirroredStore(here, remote)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5), hands=hands)
@@ -184,35 +205,27 @@ def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(
     assert not {int(name.split("-")[1]) for name in remote.names() if "part" in name} & {0, 1, 2}
 
 
-def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there(tmp_path: Path) -> None:
+def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there(
+    here: FolderStore, remote: Remote
+) -> None:
     """A round that takes longer than the time of grace: a slow store, or much that waited."""
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     written(here, SENT[:1])  # ends with a short segment, which another run replaces
     (short,) = (name for name in here.names() if name.startswith("segment"))
-    inside, done = threading.Event(), threading.Event()
     reported: list[str] = []
-
-    def before(name: str) -> None:
-        if name != MARKER:
-            inside.set()
-            assert done.wait(60)
-
-    remote.before = before
+    inside, done = held_up(remote)
     mirror = MirroredStore(here, remote, options=MirrorOptions(report=reported.append))
     mirror.copy_all()
     assert inside.wait(60)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5))
     assert short in here.names()
     done.set()
-    assert mirror.finish(wait_seconds=60) == 0
+    check_copied(mirror)
     assert remote.edges == [0, 8]  # The remote raises where a manifest names what is not there.
     assert reported == []
     assert short not in here.names()
-    assert named(remote) == named(here)
 
 
-def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_a_store_that_lost_files_while_it_failed_gets_them_again(here: FolderStore, remote: Remote) -> None:
     mirror = MirroredStore(here, remote)
 
     def after(frame: int) -> None:
@@ -230,9 +243,8 @@ def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path)
 
 
 @pytest.mark.parametrize("frame", [2, 3])
-def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
+def test_a_killed_writer_is_followed_up(here: FolderStore, remote: Remote, frame: int) -> None:
     """The thread dies with the process, anywhere; the next run compares."""
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     written(here, SENT[:frame])
     names = sorted(here.names() - {MANIFEST})
     for name in names[: frame + 1]:
@@ -241,9 +253,8 @@ def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
     check_copied(mirror)
 
 
-def test_after_an_outage_only_what_is_named_is_copied(tmp_path: Path) -> None:
+def test_after_an_outage_only_what_is_named_is_copied(here: FolderStore, remote: Remote) -> None:
     """Parts of groups that are segments by now stay in the folder for the time of grace, and nobody asks for them."""
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     copied: list[str] = []
     remote.before = copied.append
     remote.reachable.clear()
@@ -251,15 +262,13 @@ def test_after_an_outage_only_what_is_named_is_copied(tmp_path: Path) -> None:
     written(mirror, packets(30))
     assert sum(name.startswith("part") for name in here.names()) == 30
     remote.reachable.set()
-    assert mirror.finish(wait_seconds=60) == 0
+    check_copied(mirror)
     assert not any(name.startswith("part") for name in copied)
     assert len([name for name in copied if name.startswith("segment")]) == 10
-    assert named(remote) == named(here)
 
 
-def test_a_slow_store_is_behind_by_a_round_however_long_the_stream_is(tmp_path: Path) -> None:
+def test_a_slow_store_is_behind_by_a_round_however_long_the_stream_is(here: FolderStore, remote: Remote) -> None:
     """The store takes as long for a file as three frames take: parts that were replaced meanwhile are left out."""
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     turns, copied = threading.Semaphore(0), list[str]()
 
     def before(name: str) -> None:
@@ -272,14 +281,12 @@ def test_a_slow_store_is_behind_by_a_round_however_long_the_stream_is(tmp_path: 
     written(mirror, sent, after=lambda frame: frame % 3 == 2 and turns.release())
     for _ in range(200):
         turns.release()
-    assert mirror.finish(wait_seconds=60) == 0
+    check_copied(mirror)
     assert len(copied) < 90
-    assert named(remote) == named(here)
 
 
-def test_a_store_that_is_filled_again_keeps_its_manifest(tmp_path: Path) -> None:
+def test_a_store_that_is_filled_again_keeps_its_manifest(here: FolderStore, remote: Remote) -> None:
     hands = Hands()
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     options = MirrorOptions(grace_seconds=5.0, elapsed=lambda: hands.elapsed)
     mirror = MirroredStore(here, remote, options=options)
     written(mirror, SENT, hands=hands)
@@ -298,31 +305,24 @@ def test_a_store_that_is_filled_again_keeps_its_manifest(tmp_path: Path) -> None
     check_copied(mirror)
 
 
-def test_what_comes_again_while_its_removal_waits_for_a_round_stays(tmp_path: Path) -> None:
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+def test_what_comes_again_while_its_removal_waits_for_a_round_stays(here: FolderStore, remote: Remote) -> None:
     written(here, SENT[:1])
     (short,) = (name for name in here.names() if name.startswith("segment"))
-    data, inside, done = here.get(short), threading.Event(), threading.Event()
-
-    def before(name: str) -> None:
-        inside.set()
-        assert done.wait(60)
-
-    remote.before = before
+    data = here.get(short)
+    inside, done = held_up(remote)
     mirror = MirroredStore(here, remote)
     mirror.copy_all()
     assert inside.wait(60)
     mirror.delete(short)
+    assert short in here.names(), "its removal waits"
     mirror.put(short, data)
     done.set()
-    assert mirror.finish(wait_seconds=60) == 0
+    check_copied(mirror)
     assert short in here.names()
-    assert named(remote) == named(here)
 
 
-def test_what_an_earlier_run_has_left_is_removed_little_by_little(tmp_path: Path) -> None:
+def test_what_an_earlier_run_has_left_is_removed_little_by_little(here: FolderStore, remote: Remote) -> None:
     hands = Hands()
-    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     MirroredStore(here, remote).claim()
     for frame in range(100):
         FolderStore.put(remote, f"part-{frame:08d}-{frame:016x}.sgs", b"")

@@ -134,18 +134,9 @@ class FreeBins:
         """The same bins with zero change."""
         return FreeBins.unchanged(self.births, self.bins)
 
-    @classmethod
-    def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
-        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change. Raises StreamError if
-        a bin is beyond 22 bits."""
-        return cls.unchanged(births.cpu().numpy().astype(np.int64), quantize(values, _steps_of_columns(steps)))
-
-    def dequantized(self, steps: Mapping[str, float]) -> Tensor:
-        """The values ``[F, 14]``."""
-        return dequantize(self.bins, _steps_of_columns(steps))
-
 
 def _steps_of_columns(steps: Mapping[str, float]) -> NDArray[np.float32]:
+    """The step of each column of free Gaussians, ``[14]``."""
     widths = [parameter.columns for parameter in FREE_PARAMETERS]
     return np.repeat(np.array([steps[parameter.name] for parameter in FREE_PARAMETERS], np.float32), widths)
 
@@ -298,7 +289,8 @@ def quantize_state(
     }
     free = FreeBins.none()
     if "free" in dynamic:
-        free = FreeBins.quantized(state["free"], state["free_births"], steps)
+        births = state["free_births"].cpu().numpy().astype(np.int64)
+        free = FreeBins.unchanged(births, quantize(state["free"], _steps_of_columns(steps)))
     return SceneBins.unchanged(np.concatenate([nothing, *rows], axis=1), columns, weights, free)
 
 
@@ -312,7 +304,7 @@ def dequantize_state(
     for name, weights in bins.weights.items():
         state[name] = dequantize(weights[:, 0], steps[name])
     if "free" in dynamic:
-        state["free"] = bins.free.dequantized(steps)
+        state["free"] = dequantize(bins.free.bins, _steps_of_columns(steps))
         state["free_births"] = torch.from_numpy(bins.free.births.copy())
     return state
 

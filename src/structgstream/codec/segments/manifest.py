@@ -352,11 +352,6 @@ class Manifest:
     # of the group being written, none when live is False
     parts: Annotated[tuple[PartEntry, ...], partial(_list, kind=PartEntry, most=MAX_GROUP_FRAMES)]
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """The names of the files that the manifest itself names."""
-        return tuple(entry.file for part in (self.periods, self.history, self.segments, self.parts) for entry in part)
-
 
 def sha256_of(data: bytes) -> str:
     """The SHA-256 of a file's content, as hex digits."""
