@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are whole or not there, whenever the process is killed and whatever the system refuses."""
+"""Files that are whole or not there, whatever is killed or refused; files that grow; locks."""
 
 import errno
 import os
 import stat
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -15,6 +18,8 @@ from structgstream.atomic_files import (
     atomic_file,
     atomic_write,
     give_name,
+    lock_file,
+    open_lockable,
     partial_path,
     remove_unused,
     replacing,
@@ -170,17 +175,14 @@ def test_a_folder_without_permission_is_reported(tmp_path: Path, monkeypatch: py
         atomic_write(tmp_path / "a", NEW)
 
 
-def test_a_file_in_the_place_of_the_folder_is_reported(tmp_path: Path) -> None:
+def test_what_is_in_the_place_of_the_folder_or_the_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match=r"file/x cannot be written \(.*file is a file\)\.$"):
         atomic_write(tmp_path / "file" / "x", b"", new_folder=True)
-
-
-def test_a_folder_in_the_place_of_the_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "taken").mkdir()
     with pytest.raises(StorageError, match=r"taken cannot be written \(Is a directory\)"):
         atomic_write(tmp_path / "taken", NEW)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "taken"]
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP])
@@ -255,3 +257,89 @@ def test_what_another_process_writes_is_not_removed(tmp_path: Path) -> None:
     path.mkdir()
     with pytest.raises(StorageError, match="cannot be replaced .*; choose another name"):
         remove_unused(path)
+
+
+def test_two_writers_of_a_growing_file_do_not_mix(tmp_path: Path) -> None:
+    first = GrowingFile(tmp_path / "a")
+    first.append(b"one")
+    with pytest.raises(StorageError, match="Another process writes"):
+        GrowingFile(tmp_path / "a")
+    first.append(b"two")
+    first.close()
+    assert partial_path(tmp_path / "a").read_bytes() == b"onetwo"
+
+
+def test_a_growing_file_that_has_become_shorter_is_not_continued(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="has changed"):
+        GrowingFile(tmp_path / "a", keep=5)
+
+
+def test_what_another_process_has_finished_meanwhile_is_not_cut_off(tmp_path: Path) -> None:
+    """It has been opened under its other name just before that."""
+    path = tmp_path / "a"
+    partial_path(path).write_bytes(b"one")
+    opened = os.open
+
+    def slow(name: Path, flags: int, mode: int = 0o777) -> int:
+        descriptor = opened(name, flags, mode)
+        if partial_path(path).exists() and not path.exists():
+            partial_path(path).rename(path)
+        return descriptor
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "open", slow)
+        with pytest.raises(StorageError, match="Another process has changed"):
+            GrowingFile(path, keep=2)
+    assert path.read_bytes() == b"one"
+
+
+def test_the_folder_of_a_growing_file_is_created_or_reported(tmp_path: Path) -> None:
+    GrowingFile(tmp_path / "new" / "folder" / "a").close()
+    assert partial_path(tmp_path / "new" / "folder" / "a").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="cannot be written"):
+        GrowingFile(tmp_path / "file" / "a")
+
+
+TRY = "import sys; from structgstream.atomic_files import lock_file\n"
+TRY += "print(lock_file(open(sys.argv[1], 'w'), holder=sys.argv[2]))"
+
+
+def another(path: Path, holder: str) -> bool:
+    """Whether another process gets the lock."""
+    command = [sys.executable, "-c", TRY, str(path), holder]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True\n"
+
+
+@pytest.mark.parametrize("holder", ["file", "process"])
+def test_a_lock_keeps_others_out_until_its_file_is_closed(tmp_path: Path, holder: Literal["file", "process"]) -> None:
+    """Others are all open files, or other processes."""
+    path = tmp_path / "lock"
+    with path.open("w") as first, path.open("w") as second:
+        assert lock_file(first, holder=holder)
+        assert lock_file(second, holder=holder) == (holder == "process")
+        assert not another(path, holder)
+    assert another(path, holder)
+
+
+@pytest.mark.parametrize("holder", ["file", "process"])
+def test_a_file_system_without_locks_gives_them_to_everyone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, holder: Literal["file", "process"]
+) -> None:
+    monkeypatch.setattr("fcntl.flock", refuse(errno.ENOLCK))
+    monkeypatch.setattr("fcntl.lockf", refuse(errno.ENOLCK))
+    with (tmp_path / "lock").open("w") as file:
+        assert lock_file(file, holder=holder)
+
+
+def test_what_is_in_a_lockable_file_stays_and_a_link_to_a_file_is_not_followed(tmp_path: Path) -> None:
+    mine, link, dangling = tmp_path / "mine", tmp_path / "link", tmp_path / "dangling"
+    mine.write_text("mine")
+    link.symlink_to(mine)
+    dangling.symlink_to(tmp_path / "missing")
+    open_lockable(mine).close()
+    for path in (link, dangling):
+        with pytest.raises(OSError, match=f"{path.name} in it is a link, which is not followed"):
+            open_lockable(path)
+    assert mine.read_text() == "mine"
+    assert not (tmp_path / "missing").exists()

@@ -16,9 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
-from structgstream.executors import launch, ray_cluster
-from structgstream.executors import tasks as opening
-from structgstream.executors import tasks as process
+from structgstream.executors import launch, ray_cluster, tasks
 from structgstream.executors.tasks import (
     TAIL_BYTES,
     CommandProcess,
@@ -154,7 +152,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         def stop(self) -> None:
             pass
 
-    monkeypatch.setattr(opening, "LocalEngine", Engine)
+    monkeypatch.setattr(tasks, "LocalEngine", Engine)
     monkeypatch.setattr(ray_cluster, "RayEngine", Engine)
     return given
 
@@ -348,7 +346,7 @@ def test_asked_it_may_end_by_itself(tmp_path: Path) -> None:
 
 
 def test_one_that_does_not_listen_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "ENDING_SECONDS", 0.2)
+    monkeypatch.setattr(tasks, "ENDING_SECONDS", 0.2)
     log = tmp_path / "log"
     running = running_of("sh", "-c", "trap '' TERM; echo ready; while :; do sleep 0.01; done", log=log)
     wait_for(log)
@@ -384,23 +382,20 @@ LAUNCH = [sys.executable, "-I", "-S", launch.__file__]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
 
 
-def launched(*command: str, parent: int | None = None) -> subprocess.CompletedProcess[str]:
-    tied = str(os.getpid() if parent is None else parent)
-    return subprocess.run([*LAUNCH, tied, *command], capture_output=True, text=True, check=False)
+def launched(*command: str, parent: int) -> subprocess.Popen[str]:
+    words = [*LAUNCH, str(parent), *command]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_it_becomes_the_command_with_its_words_and_status() -> None:
-    done = launched("sh", "-c", 'echo "$0 and $1"; exit 3', "two words", "*")
-    assert (done.returncode, done.stdout, done.stderr) == (3, "two words and *\n", "")
-
-
-def test_it_is_the_same_process() -> None:
-    process = subprocess.Popen([*LAUNCH, str(os.getpid()), "sh", "-c", "echo $$"], stdout=subprocess.PIPE, text=True)
-    assert process.communicate()[0] == f"{process.pid}\n"
+    process = launched("sh", "-c", 'echo "$$ $0 and $1"; exit 3', "two words", "*", parent=os.getpid())
+    assert process.communicate() == (f"{process.pid} two words and *\n", ""), "the same process"
+    assert process.returncode == 3
 
 
 @LINUX
 def test_a_parent_that_has_ended_before_begins_nothing(tmp_path: Path) -> None:
-    done = launched("touch", str(tmp_path / "begun"), parent=1)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    process = launched("touch", str(tmp_path / "begun"), parent=1)
+    assert process.communicate() == ("", "")
+    assert process.returncode == 0
     assert not (tmp_path / "begun").exists()

@@ -240,16 +240,17 @@ def test_torn_notes_are_passed_over(parts: Parts) -> None:
     assert set(read_completed(parts.folder)) == {"header"}
 
 
+def copy(parts: Parts, folder: Path) -> None:
+    shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
+
+
 def test_killed_at_any_step_of_a_note_the_notes_are_those_before_or_one_more(tmp_path: Path, parts: Parts) -> None:
     """And the next note is not lost, as it was when it was appended to a line that a kill had cut."""
 
     def noted(folder: Path) -> None:
         Parts(folder).record(TaskResult("track", 0, 1.0), "key", folder / "header.sgs", frames=5)
 
-    def begin(folder: Path) -> None:
-        shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
-
-    for folder in folders_of_the_killed(tmp_path, noted, begin=begin):
+    for folder in folders_of_the_killed(tmp_path, noted, begin=lambda folder: copy(parts, folder)):
         assert set(read_completed(folder)) in ({"header"}, {"header", "track"})
         noted(folder)
         assert set(read_completed(folder)) == {"header", "track"}
@@ -264,10 +265,7 @@ def test_killed_at_any_step_of_clearing_what_is_left_is_refused_as_before_or_not
         with Parts(folder).locked():
             Parts(folder).clear()
 
-    def begin(folder: Path) -> None:
-        shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
-
-    for folder in folders_of_the_killed(tmp_path, cleared, begin=begin):
+    for folder in folders_of_the_killed(tmp_path, cleared, begin=lambda folder: copy(parts, folder)):
         left = Parts(folder)
         if left.header.exists():
             with pytest.raises(ConfigError, match="has parts of another run"):

@@ -122,11 +122,6 @@ def test_failures_are_tried_again_so_often(store: ObjectFolder, monkeypatch: pyt
             store.read("a")
 
 
-@pytest.fixture
-def staging(store: ObjectFolder, tmp_path: Path) -> Staging:
-    return Staging(store, tmp_path / "here")
-
-
 def run(store: ObjectFolder, script: str, **files: Any) -> int:
     """The status of a command with these files, whose first word is the folder of this machine."""
     with pytest.MonkeyPatch.context() as variables:
@@ -217,8 +212,8 @@ def test_a_growing_file_goes_on_here_or_on_another_machine(store: ObjectFolder, 
     assert run(store, '[ ! -e "$0/t.partial" ]', **files) == 0, "a whole file is not one that grows"
 
 
-def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) -> None:
-    path = staging.folder / "t"
+def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(store: ObjectFolder, tmp_path: Path) -> None:
+    staging, path = Staging(store, tmp_path / "here"), tmp_path / "here" / "t"
     path.parent.mkdir()
     for content, ended, stored in (
         (b"a" * 100, False, 100),
@@ -229,7 +224,7 @@ def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) ->
     ):
         path.write_bytes(content)
         staging.put_growing("t", ended=ended)
-        assert staging.store.size("t") == stored
+        assert store.size("t") == stored
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:

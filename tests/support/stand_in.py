@@ -24,12 +24,10 @@ from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
-BYTES = 64
-
 
 def line(*facts: object) -> bytes:
     """A frame: deterministic, with its own checksum at the end."""
-    body = hashlib.sha256(repr(facts).encode()).hexdigest()[:BYTES]
+    body = hashlib.sha256(repr(facts).encode()).hexdigest()
     return f"{facts[0]} {facts[1]} {body} {hashlib.sha256(body.encode()).hexdigest()[:8]}\n".encode()
 
 

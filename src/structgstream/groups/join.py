@@ -29,7 +29,7 @@ MAX_GROUPS = 8
 """Number of groups after which a run ends, or more if the last of them has fewer than :data:`OWN_FRAMES` frames: a
 process takes two seconds to start, and reports its result only when it ends."""
 POLL_SECONDS = 0.2
-OnBorder = Callable[[Border], None]
+OnBorder = Callable[[Border], object]
 
 
 def join_segments(
@@ -39,7 +39,7 @@ def join_segments(
     check: bool = False,
     backend: Backend | None = None,
     workers: int = 1,
-    on_border: OnBorder | None = None,
+    on_border: OnBorder = lambda border: None,
 ) -> int:
     """Writes the stream of these segments, in order of their frames, and returns its number of frames.
 
@@ -65,7 +65,7 @@ def join_segments(
     firsts = [0, *accumulate(lengths)][:-1] if backend is None else [0]
     runs = [] if backend is None or workers == 1 else runs_of(lengths, workers=workers)
     if backend is not None and len(runs) > 1:
-        records = _blended_by_workers(ordered, runs, output, backend, workers, on_border or (lambda border: None))
+        records = _blended_by_workers(ordered, runs, output, backend, workers, on_border)
     else:
         blender = None if backend is None else GroupBlender(first.header, backend, on_border=on_border)
         records = _records(ordered, blender)

@@ -272,13 +272,11 @@ class GroupBlender:
     """Blends the groups of a stream, which must be given in order; at most four scenes are in memory. The frames around
     borders are rendered by ``backend``."""
 
-    def __init__(
-        self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None
-    ) -> None:
+    def __init__(self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], object]) -> None:
         self._header, self._backend = header, backend
         self._rig = header.similarity.rig(header.rig)
         self._shown: deque[Scene] = deque(maxlen=2)
-        self._on_border = on_border or (lambda border: None)
+        self._on_border = on_border
 
     def follow(self, segment: Segment) -> None:
         """Start after a group whose last two frames are not blended: the first group, or one of at least
