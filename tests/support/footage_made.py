@@ -6,7 +6,6 @@ from functools import cache
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.calibration.board import Board
 from tests.support.captures import write_video
 from tests.support.filmed import Film, board_plane, ring, room, turned
-from tests.support.takes import balls
+from tests.support.takes import with_balls
 
 FPS = 30.0
 FOCAL, SIZE = 290.0, (320, 240)
@@ -37,24 +36,13 @@ def centred(rig: dict[str, LensCamera]) -> dict[str, LensCamera]:
     return rig
 
 
-def with_balls(background: Picture, filmed: LensCamera, seconds: float) -> Picture:
-    """The balls of ``takes`` at an instant in front of a picture."""
-    drawn, camera = background.copy(), filmed.camera
-    points = balls(seconds) @ camera.viewmat.numpy()[:3, :3].T + camera.viewmat.numpy()[:3, 3]
-    focal, (x0, y0) = float(camera.K[0, 0]), (float(camera.K[0, 2]), float(camera.K[1, 2]))
-    for index in np.argsort(-points[:, 2]):
-        x, y, z = points[index]
-        at = [round((focal * x / z + x0 - 0.5) * 16), round((focal * y / z + y0 - 0.5) * 16)]
-        cv2.circle(drawn, at, round(focal * 0.1 / z * 16), (250, 40 * int(index), 20), -1, cv2.LINE_AA, 4)
-    return drawn
-
-
 def write_take(folder: Path, *, starts: Sequence[int], frames: int) -> dict[str, LensCamera]:
     """A video a camera of the room with balls; ``starts`` are the frames that each camera begins with."""
     rig, pictures = still_room(len(starts))
     for start, (name, filmed) in zip(starts, rig.items(), strict=True):
         moments = (np.arange(frames) + start) / FPS
-        write_video(folder / f"{name}.mp4", [with_balls(pictures[name], filmed, moment) for moment in moments], fps=FPS)
+        shots = [with_balls(pictures[name], filmed.camera, moment, radius=0.1) for moment in moments]
+        write_video(folder / f"{name}.mp4", shots, fps=FPS)
     return rig
 
 
