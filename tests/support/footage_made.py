@@ -5,15 +5,14 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.calibration.board import Board
 from tests.support.captures import write_video
 from tests.support.filmed import Film, board_plane, ring, room, turned
+from tests.support.sounds import add_sound
 from tests.support.takes import with_balls
 
 FPS = 30.0
@@ -63,18 +62,8 @@ def write_board_take(folder: Path, rig: Mapping[str, LensCamera], *, instants: i
         write_video(folder / f"{name}.mp4", shots, instants=[FPS * period * index for index in range(instants)])
 
 
-def add_sound(video: Path, samples: NDArray[np.float32]) -> None:
-    """The video with a sound track, in a file of the same name for Matroska."""
-    with av.open(str(video)) as source, av.open(str(video.with_suffix(".mkv")), "w") as target:
-        pictures = target.add_stream_from_template(source.streams.video[0])
-        sound = target.add_stream("pcm_s16le", rate=SAMPLE_RATE)
-        for packet in source.demux(video=0):
-            if packet.size:
-                packet.stream = pictures
-                target.mux(packet)
-        loud = (samples / np.abs(samples).max() * 30_000).astype(np.int16)[None]
-        frame = av.AudioFrame.from_ndarray(loud, format="s16", layout="mono")
-        frame.sample_rate, frame.pts = SAMPLE_RATE, 0
-        target.mux(sound.encode(frame))
-        target.mux(sound.encode())
+def put_sound(video: Path, samples: NDArray[np.float32]) -> None:
+    """The video becomes one of the same name for Matroska that has a mono track of ``samples [N]``."""
+    loud = samples[None] / np.abs(samples).max()
+    add_sound(video, video.with_suffix(".mkv"), 0.9 * loud, codec="pcm_s16le")
     video.unlink()

@@ -9,10 +9,10 @@ from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
 PATIENCE_SECONDS = 60.0
 
 
-def writes(name: str, folder: Path, *, then: str = "true", retries: int = 5) -> Task:
+def writes(name: str, folder: Path, *, then: str = "true") -> Task:
     """Notes in ``folder/begun`` that it has begun, does ``then``, and makes ``folder/NAME``."""
     script = f'echo {name} >> "$0/begun"; {then} && echo {name} > "$0/{name}"'
-    return Task(name, ("sh", "-c", script, str(folder)), str(folder / name), retries=retries)
+    return Task(name, ("sh", "-c", script, str(folder)), str(folder / name), retries=5)
 
 
 def module(name: str, *arguments: str) -> Task:
