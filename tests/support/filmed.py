@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from structgstream.cameras import Camera
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.geometry import Floats
 from structgstream.preparation.calibration.board import Board
@@ -178,9 +179,4 @@ def room(seed: int = 0) -> tuple[Plane, ...]:
 
 def turned(degrees: float, *, axis: int) -> Floats:
     """The rotation ``[3, 3]`` about a coordinate axis."""
-    one, two = [index for index in range(3) if index != axis]
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    found = np.eye(3)
-    found[one, one] = found[two, two] = cosine
-    found[one, two], found[two, one] = (-sine, sine) if axis != 1 else (sine, -sine)
-    return found
+    return rotation_matrix(np.radians(degrees) * np.eye(3)[axis])
