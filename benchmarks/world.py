@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.evaluation.camera_path import look_at
@@ -120,11 +119,6 @@ def moved(scene: Scene, *, share: float, shift: tuple[float, float, float]) -> S
     return replace(scene, anchors=replace(scene.anchors, positions=shifted))
 
 
-def picture(scene: Scene, camera: Camera, backend: Backend) -> NDArray[np.uint8]:
-    """What ``camera`` records, ``[H, W, 3]`` uint8."""
-    return render_picture(scene, camera, backend)
-
-
 def wall_world(
     backend: Backend,
     *,
@@ -147,7 +141,7 @@ def wall_world(
     g = np.random.default_rng(seed)
 
     def taken(scene: Scene, index: int) -> MultiViewFrame:
-        images = {name: picture(scene, rig[name], backend) for name in rig}
+        images = {name: render_picture(scene, rig[name], backend) for name in rig}
         for name in rig.training if noise else ():
             grain = noise * g.standard_normal(images[name].shape, dtype=np.float32)
             images[name] = (images[name] + grain).round().clip(0, 255).astype(np.uint8)
@@ -172,4 +166,4 @@ def fitted(world: World, backend: Backend, config: OnlineConfig) -> FitResult:
 
 def held_out_psnr(scene: Scene, world: World, backend: Backend) -> float:
     """PSNR of ``scene`` against frame 1 at the held-out camera, dB."""
-    return psnr(picture(scene, world.rig[HELD_OUT], backend), world.frame.images[HELD_OUT])
+    return psnr(render_picture(scene, world.rig[HELD_OUT], backend), world.frame.images[HELD_OUT])

@@ -161,9 +161,7 @@ class PhoneVideo:
         self._container.close()
 
 
-def write_phones(
-    source: FrameSource, folder: Path, phones: Mapping[str, Phone], *, silent: bool = False, suffix: str = ".mov"
-) -> None:
+def write_phones(source: FrameSource, folder: Path, phones: Mapping[str, Phone], *, silent: bool = False) -> None:
     """Writes ``CAMERA.mov`` of each camera and ``truth.json``."""
     folder.mkdir(parents=True, exist_ok=True)
     videos = {}
@@ -172,7 +170,7 @@ def write_phones(
         seconds = max(phone.stamps) + 0.2
         heard = None if silent else sound(phone, seconds=seconds, seed=number)
         videos[name] = PhoneVideo(
-            folder / f"{name}{suffix}", phone, size=(camera.width, camera.height), fps=source.fps, heard=heard
+            folder / f"{name}.mov", phone, size=(camera.width, camera.height), fps=source.fps, heard=heard
         )
     for frame in source.frames():
         for name, video in videos.items():

@@ -23,7 +23,7 @@ from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.preparation.calibration.structure import refine, solve_structure
-from tests.support.calibration_errors import CameraError, calibration_errors
+from tests.support.calibration_errors import CameraError, calibration_errors, radius_of
 
 Rig = Mapping[str, LensCamera]
 
@@ -52,8 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def perturbed(rig: Rig, *, degrees: float, percent: float, seed: int = 0) -> dict[str, LensCamera]:
     """Every camera turned by ``degrees``, moved by ``percent`` of the rig's radius and zoomed by ``percent``."""
     generator = np.random.default_rng(seed)
-    centers = np.stack([filmed.camera.center.numpy() for filmed in rig.values()])
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    radius = radius_of(rig)
     found = {}
     for name, filmed in rig.items():
         axis, step = (vector / np.linalg.norm(vector) for vector in generator.normal(size=(2, 3)))

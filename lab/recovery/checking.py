@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, CameraRig, rig_radius
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, SourceWrapper, WithRig, every_nth_frame, section
 from structgstream.frames import MultiViewFrame
@@ -255,8 +255,7 @@ def _late(source: FrameSource, mistake: Mistake, name: str, found: Examination) 
 
 def _distance(found: Examination, name: str) -> tuple[float, float]:
     """Median distance of a camera to the points that it sees, in rig radii, and the radius."""
-    centers = np.stack([camera.center.numpy() for camera in found.cameras.values()])
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    radius = rig_radius(CameraRig(dict(found.cameras)))
     tracks, center = found.tracks, found.cameras[name].center.numpy()
     points = tracks.points[tracks.point[tracks.of(name)]]
     return float(np.median(np.linalg.norm(points - center, axis=1))) / radius, radius

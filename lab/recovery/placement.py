@@ -25,6 +25,7 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared, write_prepared
 from structgstream.preparation.calibration.solved import rig_alignment
+from tests.support.calibration_errors import radius_of
 
 Rig = Mapping[str, LensCamera]
 Floats = NDArray[np.float64]
@@ -45,7 +46,7 @@ def own_errors(estimate: Rig, truth: Rig, *, depths: tuple[float, float] = NEAR,
         count: of the points before each camera.
     """
     generator = np.random.default_rng(0)
-    shown = {name: points_before(truth[name], generator, depths, count, _radius(truth)) for name in estimate}
+    shown = {name: points_before(truth[name], generator, depths, count, radius_of(truth)) for name in estimate}
     found = {}
     for name, points in shown.items():
         moved = placed(points, estimate, truth)
@@ -87,7 +88,7 @@ def exactly_placed(name: str, estimate: Rig, truth: Rig) -> LensCamera:
     from scipy.optimize import least_squares
 
     others = {other: filmed for other, filmed in estimate.items() if other != name}
-    points = points_before(truth[name], np.random.default_rng(0), ALL, 600, _radius(truth))
+    points = points_before(truth[name], np.random.default_rng(0), ALL, 600, radius_of(truth))
     moved = placed(points, others, truth)
     sure = np.isfinite(_misses(moved, points, others, truth)).all(2).sum(0) >= 3
     seen = truth[name].pixels(points)[sure]
@@ -113,7 +114,7 @@ def exactly_placed(name: str, estimate: Rig, truth: Rig) -> LensCamera:
 def _misses(found: Floats, points: Floats, estimate: Rig, truth: Rig) -> Floats:
     """Projections of ``found`` minus true ones of ``points``, ``[C, P, 2]``; NaN where a camera sees no point."""
     misses = np.full((len(estimate), len(points), 2), np.nan)
-    least = MIN_DEPTH * _radius(truth)
+    least = MIN_DEPTH * radius_of(truth)
     for index, (name, filmed) in enumerate(estimate.items()):
         camera = truth[name].camera
         viewmat, pixels = camera.viewmat.numpy(), truth[name].pixels(points)
@@ -121,11 +122,6 @@ def _misses(found: Floats, points: Floats, estimate: Rig, truth: Rig) -> Floats:
         seen &= (pixels < [camera.width, camera.height]).all(1)
         misses[index, seen] = filmed.pixels(found[seen]) - pixels[seen]
     return misses
-
-
-def _radius(rig: Rig) -> float:
-    centers = np.stack([filmed.camera.center.numpy() for filmed in rig.values()])
-    return float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def held_out_scores(stream: Path, capture: Path, rig: Rig, truth: Rig, *, work: Path) -> dict[str, tuple[float, float]]:

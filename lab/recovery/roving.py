@@ -38,7 +38,7 @@ from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
 from structgstream.scene.render import render_picture
-from tests.support.calibration_errors import calibration_errors
+from tests.support.calibration_errors import calibration_errors, radius_of
 
 HELD_OUT = ("0", "10", "15", "30")  # of basketball
 
@@ -63,7 +63,7 @@ def poses(folder: Path, count: int, walk: str) -> dict[str, Any]:
     result = {"said": said, "seconds": time.process_time() - begun, "cameras": _errors(estimated, truth)}
     if found.roving:
         alignment = rig_alignment(estimated, truth)
-        radius = _radius(truth)
+        radius = radius_of(truth)
         frames = {name: (alignment.filmed(own.filmed), phone(_frame(name))) for name, own in found.roving.items()}
         degrees = [_angle(one, other) for one, other in frames.values()]
         away = [float((one.camera.center - other.camera.center).norm()) / radius for one, other in frames.values()]
@@ -84,11 +84,6 @@ def _errors(estimated: Mapping[str, LensCamera], truth: Mapping[str, LensCamera]
         "lens_pixels": [error.lens_pixels for error in errors],
     }
     return {kind: [float(np.median(own)), max(own)] for kind, own in values.items()}
-
-
-def _radius(truth: Mapping[str, LensCamera]) -> float:
-    centers = np.stack([own.camera.center.numpy() for own in truth.values()])
-    return float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def _angle(one: LensCamera, other: LensCamera) -> float:

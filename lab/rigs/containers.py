@@ -13,7 +13,7 @@ from lab.rigs.sound import SAMPLE_RATE
 from structgstream.data.video_writer import bt709_frame, state_bt709
 
 TIME_BASE = Fraction(1, 90_000)
-CRF = 14
+CRF = 14  # constant rate factor of x264
 
 
 def write_video(
@@ -23,7 +23,6 @@ def write_video(
     *,
     fps: float,
     sound: NDArray[np.float64] | None = None,
-    crf: int = CRF,
 ) -> None:
     """An mp4 of high quality.
 
@@ -33,13 +32,12 @@ def write_video(
         stamps: seconds, ascending, of each picture; rounded to 1/90000 s.
         fps: what the container states as its rate.
         sound: mono samples at :data:`SAMPLE_RATE` from second zero on, full scale 1.
-        crf: constant rate factor of x264.
     """
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
         video = container.add_stream(
             "libx264",
             rate=Fraction(fps).limit_denominator(1001),
-            options={"crf": str(crf), "preset": "veryfast", "threads": "1", "flags": "+bitexact", "g": "30"},
+            options={"crf": str(CRF), "preset": "veryfast", "threads": "1", "flags": "+bitexact", "g": "30"},
         )
         context = video.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality

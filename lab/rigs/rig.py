@@ -121,11 +121,11 @@ def traced() -> dict[str, Traced]:
     return found
 
 
-def corner_directions(camera: LensCamera, *, circle_degrees: float = FISHEYE_CIRCLE_DEGREES) -> NDArray[np.float32]:
+def corner_directions(camera: LensCamera) -> NDArray[np.float32]:
     """World directions ``[H + 1, W + 1, 3]`` through the corners of pixels; zero outside of the lens's image circle."""
     across, down = np.meshgrid(np.arange(camera.camera.width + 1.0), np.arange(camera.camera.height + 1.0))
     normalised = camera.to_normalized(np.stack([across, down], -1))
-    shown = np.linalg.norm(normalised, axis=-1) < math.tan(math.radians(circle_degrees) / 2)  # NaN is not
+    shown = np.linalg.norm(normalised, axis=-1) < math.tan(math.radians(FISHEYE_CIRCLE_DEGREES) / 2)  # NaN is not
     local = np.concatenate([normalised, np.ones_like(across)[..., None]], -1)
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
     world = local @ camera.camera.viewmat[:3, :3].numpy()

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.world import wall_rig
-from lab.robustness.outside import senders
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from tests.support.sender_modules import sender
 
 WIDTH, HEIGHT, PICTURES = 128, 96, 12
 BEGIN_SECONDS, PERIOD_SECONDS = 6.0, 8.0
@@ -114,7 +114,7 @@ def read_film(folder: Path) -> Film:
 
 def send(folder: Path) -> None:
     """Sends the film of a folder until the process is ended."""
-    module, film = senders(), read_film(folder)
+    module, film = sender(), read_film(folder)
     loops = module.loops_of([*pictures()])
     lines, urls = module.opened_lines(film.transport, film.cameras)
     troubles = {name: _troubles(module, film.moments, name) for name in film.cameras}

@@ -23,9 +23,7 @@ from typing import Any
 from lab.robustness.fault_players import Players
 from lab.robustness.load import digests
 from lab.robustness.load_fetch import free_port
-from lab.robustness.load_trainer import renumbered
-from lab.robustness.outside import chromium
-from lab.robustness.stream_writers import Sent, content, edge_of
+from lab.robustness.stream_writers import Sent, content, edge_of, renumbered
 from structgstream.codec.packets import PacketSink
 from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
@@ -242,8 +240,10 @@ def watched(
         wait_until(lambda: watching.least_frames() > 0)
         shown = None
         if page:
+            from tests.support.chromium import opened_browser  # which needs pytest
+
             (folder / "browser").mkdir()
-            browser = stack.enter_context(chromium().opened_browser(folder / "browser"))
+            browser = stack.enter_context(opened_browser(folder / "browser"))
             shown = Page(stack.enter_context(browser.opened_tab()), address)
         yield server, trainers, watching, shown
 

@@ -28,8 +28,8 @@ from benchmarks.machine import load_average, machine
 from lab.robustness.glass_frames import frames_of
 from lab.robustness.glass_report import plot, table
 from lab.robustness.load import Watched, processor_seconds, serving
-from lab.robustness.outside import ROOT, chromium
 
+ROOT = Path(__file__).parents[2]
 NAME = "now"
 PATIENCE_SECONDS = 240.0
 PULL_SECONDS = 5.0
@@ -138,6 +138,8 @@ class Edges:
 
 def measured(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     """One run."""
+    from tests.support.chromium import opened_browser  # which needs pytest
+
     before = load_average()
     (folder / "streams").mkdir(parents=True)
     with ExitStack() as stack:
@@ -154,7 +156,7 @@ def measured(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
         address, server = stack.enter_context(serving(folder / "streams", nice=options.server_nice))
         memory = [stack.enter_context(Watched(process)) for process in (trainer.pid, server)]
         (folder / "browser").mkdir()
-        browser = stack.enter_context(chromium().opened_browser(folder / "browser"))
+        browser = stack.enter_context(opened_browser(folder / "browser"))
         page = Page(stack.enter_context(browser.opened_tab()), address)
         edges = Edges(manifest)
         _watch(edges, page, 60.0 * options.minutes)

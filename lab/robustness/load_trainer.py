@@ -9,14 +9,13 @@ import argparse
 import json
 import signal
 import time
-from dataclasses import replace
 from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from structgstream.codec.container.records import FRAME
+from lab.robustness.stream_writers import renumbered
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.sink import SegmentsSink
@@ -28,12 +27,6 @@ from structgstream.scene.render import render
 def packets(reader: StreamReader) -> list[Packet]:
     """All packets of a stream, in order."""
     return [[*reader.group(index)][-1] for index in range(len(reader))]
-
-
-def renumbered(packet: Packet, index: int, *, fps: float) -> Packet:
-    """The packet as that of another frame."""
-    payload = FRAME.pack(index, index / fps) + packet.payload[FRAME.size :]
-    return replace(packet, index=index, pts_seconds=index / fps, payload=payload)
 
 
 def waited_seconds() -> float:

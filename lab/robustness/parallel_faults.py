@@ -12,7 +12,6 @@ are drawn with a seed; where in a write they fall is not.
 """
 
 import argparse
-import hashlib
 import json
 import os
 import random
@@ -29,14 +28,12 @@ from pathlib import Path
 
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
-from structgstream.executors.tasks import PYTHON, LocalEngine, TaskQueue, WorkerSlot
+from structgstream.executors.tasks import LocalEngine, TaskQueue, WorkerSlot
 from structgstream.parallel.driver import Job, Unit, drive
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore
 from structgstream.parallel.parts import Parts
-from tests.support import stand_in
 from tests.support.flaky_store import flaky_store
-
-STAND_IN = (PYTHON, "-I", "-S", stand_in.__file__)
+from tests.support.stand_ins import PROGRAM, sha256
 
 
 @dataclass
@@ -64,7 +61,7 @@ def job_in(folder: Path, *, real: bool) -> Job:
         )
     else:
         track = ("--groups", "4")
-        unit = Unit("capture", 80, track=track, program=STAND_IN)
+        unit = Unit("capture", 80, track=track, program=PROGRAM)
     return Job(unit, folder / "out.sgs")
 
 
@@ -79,7 +76,7 @@ def driven(folder: Path, engine: LocalEngine, *, real: bool, url: str | None = N
     with parts.locked(), TaskQueue(engine) as executor:
         exchange = None if url is None else ObjectStore(ObjectFolder(url), parts)
         drive(given, parts, executor, exchange=exchange)
-    return hashlib.sha256(given.output.read_bytes()).hexdigest()
+    return sha256(given.output)
 
 
 def engine() -> LocalEngine:
@@ -142,7 +139,7 @@ def killed_drivers(row: Row, folder: Path, *, whole: str, kills: int, most: floa
                 raise SystemExit(f"A driver failed: {said.decode()}")
             break
         row.runs += 1
-        row.equal += hash_of(run) == whole
+        row.equal += sha256(run / "out.sgs") == whole
         shutil.rmtree(run)
     return row
 
@@ -181,7 +178,7 @@ def two_drivers(row: Row, folder: Path, *, whole: str, count: int, seed: int, re
             raise SystemExit(f"A driver failed: {said}")
         row.events += 1
         row.runs += 1
-        row.equal += hash_of(run) == whole
+        row.equal += sha256(run / "out.sgs") == whole
         shutil.rmtree(run)
     row.remark = f"{refused} refused"
     return row
@@ -197,11 +194,6 @@ def refusing_store(row: Row, folder: Path, *, whole: str, count: int, real: bool
             row.remark = f"{application.requests} requests in the last"
         row.runs += 1
     return row
-
-
-def hash_of(run: Path) -> str:
-    """Of the stream of a run."""
-    return hashlib.sha256((run / "out.sgs").read_bytes()).hexdigest()
 
 
 def table(rows: Sequence[Row]) -> str:

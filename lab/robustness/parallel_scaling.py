@@ -11,7 +11,6 @@ size of the process and of all that it began.
 """
 
 import argparse
-import hashlib
 import json
 import os
 import subprocess
@@ -22,10 +21,10 @@ from collections import defaultdict
 from pathlib import Path
 
 from structgstream.data.dataset_layouts import bundled_clip_path
-from structgstream.executors.tasks import PYTHON, ExecutorName, ExecutorOptions, Task, open_executor
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions, Task, open_executor
 from structgstream.parallel.driver import Job, State, Status, Unit, drive
 from structgstream.parallel.parts import Parts
-from tests.support import stand_in
+from tests.support.stand_ins import PROGRAM, sha256
 
 ROWS = ("local-1", "local-2", "ray-1", "ray-2")
 EMPTY_TASKS = 40
@@ -116,7 +115,7 @@ def whole_run(row: str, folder: Path) -> dict[str, object]:
         "join": notes["join"].seconds,
         "driver": memory.own,
         "below it": memory.below,
-        "sha256": hashlib.sha256((folder / "out.sgs").read_bytes()).hexdigest()[:8],
+        "sha256": sha256(folder / "out.sgs")[:8],
     }
 
 
@@ -154,8 +153,7 @@ def planned(row: str, folder: Path) -> dict[str, object]:
     """A driver that has planned 10,000 groups of commands that only look real."""
     folder.mkdir(parents=True)
     os.environ["STAND_IN_SECONDS"] = "0.001"
-    program = (PYTHON, "-I", "-S", stand_in.__file__)
-    unit = Unit("capture", PLANNED, track=("--groups", "1"), program=program)
+    unit = Unit("capture", PLANNED, track=("--groups", "1"), program=PROGRAM)
     parts, begun, seen = Parts(folder / "parts"), time.monotonic(), list[float]()
 
     def tell(status: Status) -> None:

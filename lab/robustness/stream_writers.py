@@ -58,6 +58,12 @@ class Sent:
         return bool(self.begins) and index > 0 and (not at or at in self.begins)
 
 
+def renumbered(packet: Packet, index: int, *, fps: float) -> Packet:
+    """The packet as that of another frame."""
+    payload = FRAME.pack(index, index / fps) + packet.payload[FRAME.size :]
+    return replace(packet, index=index, pts_seconds=index / fps, payload=payload)
+
+
 def repeated(reader: StreamReader, *, frames: int, each_a_period: bool = False) -> Sent:
     """A stream of ``frames`` packets, which are those of ``reader`` again and again with other numbers and times.
 
@@ -68,8 +74,7 @@ def repeated(reader: StreamReader, *, frames: int, each_a_period: bool = False) 
     packets = []
     for index in range(frames):
         (*_, one) = reader.group(index % len(reader))
-        payload = FRAME.pack(index, index / reader.header.fps) + one.payload[FRAME.size :]
-        packets.append(replace(one, index=index, pts_seconds=index / reader.header.fps, payload=payload))
+        packets.append(renumbered(one, index, fps=reader.header.fps))
     sink = MemorySink()
     sink.open(header)
     for packet in packets:
@@ -115,28 +120,17 @@ def send(sink: PacketSink, sent: Sent, start: int, report: Report) -> None:
 
 
 def real_writer(frames: int) -> Writer:
-    """Reconstructs the bundled clip with the preset tiny."""
+    """Reconstructs the bundled clip with the preset tiny and next to no iterations."""
 
     def write(path: Path, report: Report) -> None:
         from structgstream.data.dataset_layouts import bundled_clip_path
         from structgstream.data.open import open_capture
-        from structgstream.data.plane_sweep import SweepConfig
-        from structgstream.data.points import PointsConfig
         from structgstream.kernels.backend import select_backend
         from structgstream.recorder import record, segments_at, segments_folder
-        from structgstream.session.presets import TINY
         from structgstream.session.struct_gstream import stream_pipeline
+        from tests.support.small_presets import QUICK  # which needs pytest
 
-        class FewPoints(PointsConfig):
-            SWEEP_LEVELS = (SweepConfig(width=60, planes=(8, 12)),)
-
-        config = replace(
-            TINY,
-            points=FewPoints(max_points=1500),
-            initial=replace(TINY.initial, iterations=3),
-            online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
-            key_interval_seconds=0.1,
-        )
+        config = replace(QUICK, key_interval_seconds=0.1)
         source = open_capture(bundled_clip_path(), scale=0.25, frames=frames)
         storage = segments_at(segments_folder(path, may_exist=True), options=OPTIONS)
         run = record(

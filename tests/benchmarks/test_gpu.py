@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.gpu import Measurement, measured
 from structgstream.kernels.backend import cpu_backend
-from structgstream.kernels.native import native_reason
+from tests.support.backends import needs_native
 
-pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+pytestmark = needs_native
 
 
 def test_parts_are_measured_and_one_that_fails_ends_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

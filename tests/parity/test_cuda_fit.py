@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
+from benchmarks.gpu import copied
 from structgstream.kernels import cpu_fit, cuda_fit
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
@@ -21,6 +21,7 @@ from tests.parity.test_native_iterations import PLAIN, check_same_results, fitte
 from tests.support.backends import needs_native
 
 pytestmark = needs_native
+PROCESSOR = torch.device("cpu")
 Emulation = Callable[[int], KernelLibrary]
 
 
@@ -29,27 +30,12 @@ def emulated(emulation: Emulation, *, order: int = 0, slots: int | None = None) 
     return replace(cpu_backend(), iterations=partial(cuda_fit.iterations, emulation(order), slots=slots))
 
 
-def copied(frame: FitFrame) -> FitFrame:
-    """The frame with its own copy of what iterations write."""
-
-    def own(tensor: Tensor | None) -> Tensor | None:
-        return None if tensor is None else tensor.detach().clone()
-
-    leaves = [
-        leaf and leaf._replace(**{name: own(getattr(leaf, name)) for name in ("values", "first", "second", "sums")})
-        for leaf in frame.leaves
-    ]
-    views = [view._replace(image=view.image.clone()) for view in frame.views]
-    plan = frame.plan._replace(terms=frame.plan.terms.clone(), squared_errors=frame.plan.squared_errors.clone())
-    return frame._replace(leaves=leaves, views=views, plan=plan)
-
-
 def first_frame(**options: Any) -> FitFrame:
     """What the iterations of a frame begin with."""
     found: list[FitFrame] = []
 
     def begin(frame: FitFrame) -> Callable[[int, int], None]:
-        found.append(copied(frame))
+        found.append(copied(frame, PROCESSOR))
         return cpu_fit.iterations(frame)
 
     fitted(replace(cpu_backend(), iterations=begin), **options)
@@ -64,7 +50,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(emulation: Emulation, optio
         if (number, bool(frame.plan.rests[i])) in seen:
             continue
         seen.add((number, bool(frame.plan.rests[i])))
-        one, two = copied(frame), copied(frame)
+        one, two = copied(frame, PROCESSOR), copied(frame, PROCESSOR)
         cpu_fit.iterations(one)(i, i + 1)
         cuda_fit.iterations(emulation(0), two)(i, i + 1)
         assert (one.views[number].image - two.views[number].image).abs().max() < 5e-6

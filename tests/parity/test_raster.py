@@ -40,7 +40,7 @@ def camera(dtype: torch.dtype = torch.float64, device: str = "cpu") -> Viewport:
 
 
 @cache
-def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
+def gaussians(count: int = 300) -> tuple[Tensor, ...]:
     """Not to be changed."""
     g = torch.Generator().manual_seed(7)
     depths = torch.linspace(1.0, 5.0, count, dtype=torch.float64)[torch.randperm(count, generator=g)]
@@ -52,7 +52,7 @@ def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
         means,
         torch.randn(count, 4, generator=g, dtype=torch.float64),
         torch.exp(torch.randn(count, 3, generator=g, dtype=torch.float64) * 0.5 - 2.5),
-        torch.rand(count, generator=g, dtype=torch.float64) * opaque + 0.05,
+        torch.rand(count, generator=g, dtype=torch.float64) * 0.7 + 0.05,
         torch.rand(count, 3, generator=g, dtype=torch.float64),
         torch.zeros(count, 2, dtype=torch.float64),
     )

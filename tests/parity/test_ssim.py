@@ -58,8 +58,8 @@ def pictures(height: int, width: int, *, as_bytes: bool = False) -> tuple[Tensor
     return image, (target * 255).round().to(torch.uint8) if as_bytes else target
 
 
-def some_tiles(height: int, width: int, share: float = 0.4) -> TileSelection:
-    return TileSelection(torch.rand(tile_grid(width, height)) < share, width, height)
+def some_tiles(height: int, width: int) -> TileSelection:
+    return TileSelection(torch.rand(tile_grid(width, height)) < 0.4, width, height)
 
 
 def value_and_gradient(

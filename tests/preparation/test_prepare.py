@@ -20,7 +20,7 @@ from structgstream.preparation.solvers import first_clocks, matched_pictures
 from tests.support.calibration_errors import calibration_errors
 from tests.support.captures import write_picture, write_video, write_videos
 from tests.support.filmed import Film, noise_texture, ring, room
-from tests.support.footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
+from tests.support.footage_made import BOARD, FPS, centred, put_sound, write_board_take, write_take
 from tests.support.planes import room_frame
 from tests.support.rooms import write_room
 from tests.support.takes import heard
@@ -169,7 +169,7 @@ def test_sound(tmp_path: Path) -> None:
     rig = write_room(tmp_path / "videos", cameras=4, frames=150)
     clocks = {name: Clock(0.31 * index) for index, name in enumerate(rig)}
     for name, samples in heard(clocks, seconds=5).items():
-        add_sound(tmp_path / "videos" / f"{name}.mp4", samples)
+        put_sound(tmp_path / "videos" / f"{name}.mp4", samples)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out")
     found = read_prepared(tmp_path / "out")
     assert made.steps["synchronize"].startswith("audio: all cameras have sound")

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from structgstream.cameras import CameraRig, rig_radius
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.solved import rig_alignment
 
@@ -41,8 +43,7 @@ def calibration_errors(
         CalibrationError: fewer than two cameras in common.
     """
     fitted = rig_alignment(estimated, reference)
-    centers = np.stack([filmed.camera.center.numpy() for filmed in reference.values()])
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    radius = radius_of(reference)
     found = {}
     for name, filmed in estimated.items():
         if name not in reference:
@@ -50,12 +51,17 @@ def calibration_errors(
         ours, theirs = fitted.filmed(filmed).camera, reference[name].camera
         turn = (ours.viewmat[:3, :3] @ theirs.viewmat[:3, :3].T).numpy()
         found[name] = CameraError(
-            float(np.degrees(_angle(turn))),
+            float(np.degrees(Rotation.from_matrix(turn).magnitude())),
             100 * float((ours.center - theirs.center).norm()) / radius,
             100 * (_focal(filmed) / _focal(reference[name]) - 1),
             lens_difference(filmed, reference[name]),
         )
     return found
+
+
+def radius_of(rig: Mapping[str, LensCamera]) -> float:
+    """The largest distance of a camera from the mean of all."""
+    return rig_radius(CameraRig({name: filmed.camera for name, filmed in rig.items()}))
 
 
 def lens_difference(estimated: LensCamera, reference: LensCamera) -> float:
@@ -78,13 +84,6 @@ def lens_difference(estimated: LensCamera, reference: LensCamera) -> float:
 def _directions(points: NDArray[np.float64]) -> NDArray[np.float64]:
     rays = np.concatenate([points, np.ones((len(points), 1))], 1)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
-def _angle(rotation: NDArray[np.float64]) -> float:
-    """Radians; exact for small angles, where the cosine is flat."""
-    skew = rotation - rotation.T
-    sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]]) / 2
-    return float(np.arctan2(sine, (np.trace(rotation) - 1) / 2))
 
 
 def _focal(filmed: LensCamera) -> float:

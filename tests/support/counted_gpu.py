@@ -8,7 +8,7 @@ import ctypes
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
+from benchmarks.stages import mapped
 from structgstream.kernels import backend as backends
 from structgstream.kernels import cuda_fit
 from structgstream.kernels.backend import Backend, kernel_functions, reference_backend
@@ -96,20 +97,11 @@ class _Library(KernelLibrary):
         assert all(tensor is None or lies_there(tensor) for tensor in tensors)
 
 
-def _with_values(value: Any) -> Any:
-    """``value`` with the memory of its tensors on the device (``values_of``)."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: _with_values(getattr(value, f.name)) for f in fields(value)})
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(_with_values, value))
-    return list(map(_with_values, value)) if isinstance(value, list) else values_of(value)
-
-
 def _counted_iterations(library: KernelLibrary, counts: Counts, frame: FitFrame) -> Callable[[int, int], None]:
     """The native iterations, which are one operation and one wait for each call."""
     counts.add("iterations begin", waits=1)
     with counts.paused():
-        run = cuda_fit.iterations(library, _with_values(frame))
+        run = cuda_fit.iterations(library, mapped(frame, values_of))
 
     def counted(first: int, last: int) -> None:
         counts.add("iterations", waits=1)

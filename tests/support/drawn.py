@@ -3,16 +3,15 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tests.support.pictures import decoded_picture
 
 
 def pixels_of(path: Path) -> NDArray[np.uint8]:
     """``[H, W, 3]``, red first."""
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    return np.asarray(picture[..., ::-1], np.uint8)
+    return decoded_picture(path.read_bytes())
 
 
 def coloured(picture: NDArray[np.uint8], colour: str) -> int:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from structgstream.cameras import Camera
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.geometry import Floats
 from structgstream.preparation.calibration.board import Board
@@ -106,22 +107,19 @@ def ring(
     *,
     radius: float,
     arc_degrees: float,
-    height: float = 0.0,
     size: tuple[int, int] = (480, 360),
     focal: float = 420.0,
     lens: Lens | None = None,
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> dict[str, LensCamera]:
-    """Cameras on an arc around the origin that look at ``target``; world y points down."""
+    """Cameras on an arc around the origin that look at it; world y points down."""
     found = {}
     for index in range(count):
         angle = np.radians(arc_degrees) * (index / max(count - 1, 1) - 0.5)
         eye = torch.tensor(
-            [radius * np.sin(angle), height + 0.1 * radius * (-1) ** index, -radius * np.cos(angle)],
-            dtype=torch.float64,
+            [radius * np.sin(angle), 0.1 * radius * (-1) ** index, -radius * np.cos(angle)], dtype=torch.float64
         )
         K = torch.tensor([[focal, 0, size[0] / 2 + 3], [0, focal, size[1] / 2 - 2], [0, 0, 1]], dtype=torch.float64)
-        viewmat = look_at(eye, torch.tensor(target, dtype=torch.float64))
+        viewmat = look_at(eye, torch.zeros_like(eye))
         found[f"cam{index:02d}"] = LensCamera(Camera(viewmat, K, *size), lens or Pinhole())
     return found
 
@@ -181,9 +179,4 @@ def room(seed: int = 0) -> tuple[Plane, ...]:
 
 def turned(degrees: float, *, axis: int) -> Floats:
     """The rotation ``[3, 3]`` about a coordinate axis."""
-    one, two = [index for index in range(3) if index != axis]
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    found = np.eye(3)
-    found[one, one] = found[two, two] = cosine
-    found[one, two], found[two, one] = (-sine, sine) if axis != 1 else (sine, -sine)
-    return found
+    return rotation_matrix(np.radians(degrees) * np.eye(3)[axis])

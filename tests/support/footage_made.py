@@ -5,17 +5,15 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.calibration.board import Board
 from tests.support.captures import write_video
 from tests.support.filmed import Film, board_plane, ring, room, turned
-from tests.support.takes import balls
+from tests.support.sounds import add_sound
+from tests.support.takes import with_balls
 
 FPS = 30.0
 FOCAL, SIZE = 290.0, (320, 240)
@@ -37,24 +35,13 @@ def centred(rig: dict[str, LensCamera]) -> dict[str, LensCamera]:
     return rig
 
 
-def with_balls(background: Picture, filmed: LensCamera, seconds: float) -> Picture:
-    """The balls of ``takes`` at an instant in front of a picture."""
-    drawn, camera = background.copy(), filmed.camera
-    points = balls(seconds) @ camera.viewmat.numpy()[:3, :3].T + camera.viewmat.numpy()[:3, 3]
-    focal, (x0, y0) = float(camera.K[0, 0]), (float(camera.K[0, 2]), float(camera.K[1, 2]))
-    for index in np.argsort(-points[:, 2]):
-        x, y, z = points[index]
-        at = [round((focal * x / z + x0 - 0.5) * 16), round((focal * y / z + y0 - 0.5) * 16)]
-        cv2.circle(drawn, at, round(focal * 0.1 / z * 16), (250, 40 * int(index), 20), -1, cv2.LINE_AA, 4)
-    return drawn
-
-
 def write_take(folder: Path, *, starts: Sequence[int], frames: int) -> dict[str, LensCamera]:
     """A video a camera of the room with balls; ``starts`` are the frames that each camera begins with."""
     rig, pictures = still_room(len(starts))
     for start, (name, filmed) in zip(starts, rig.items(), strict=True):
         moments = (np.arange(frames) + start) / FPS
-        write_video(folder / f"{name}.mp4", [with_balls(pictures[name], filmed, moment) for moment in moments], fps=FPS)
+        shots = [with_balls(pictures[name], filmed.camera, moment, radius=0.1) for moment in moments]
+        write_video(folder / f"{name}.mp4", shots, fps=FPS)
     return rig
 
 
@@ -75,18 +62,8 @@ def write_board_take(folder: Path, rig: Mapping[str, LensCamera], *, instants: i
         write_video(folder / f"{name}.mp4", shots, instants=[FPS * period * index for index in range(instants)])
 
 
-def add_sound(video: Path, samples: NDArray[np.float32]) -> None:
-    """The video with a sound track, in a file of the same name for Matroska."""
-    with av.open(str(video)) as source, av.open(str(video.with_suffix(".mkv")), "w") as target:
-        pictures = target.add_stream_from_template(source.streams.video[0])
-        sound = target.add_stream("pcm_s16le", rate=SAMPLE_RATE)
-        for packet in source.demux(video=0):
-            if packet.size:
-                packet.stream = pictures
-                target.mux(packet)
-        loud = (samples / np.abs(samples).max() * 30_000).astype(np.int16)[None]
-        frame = av.AudioFrame.from_ndarray(loud, format="s16", layout="mono")
-        frame.sample_rate, frame.pts = SAMPLE_RATE, 0
-        target.mux(sound.encode(frame))
-        target.mux(sound.encode())
+def put_sound(video: Path, samples: NDArray[np.float32]) -> None:
+    """The video becomes one of the same name for Matroska that has a mono track of ``samples [N]``."""
+    loud = samples[None] / np.abs(samples).max()
+    add_sound(video, video.with_suffix(".mkv"), 0.9 * loud, codec="pcm_s16le")
     video.unlink()

@@ -36,10 +36,10 @@ def room_depth(camera: Camera) -> NDArray[np.float64]:
     return _hit(camera)[0]
 
 
-def room_frame(rig: CameraRig, *, seed: int = 0, textured: bool = True) -> MultiViewFrame:
+def room_frame(rig: CameraRig, *, textured: bool = True) -> MultiViewFrame:
     images = {}
     for index, name in enumerate(rig):
-        grey = _texture(*_hit(rig[name])[1:], seed=seed) if textured else np.full((HEIGHT, WIDTH, 3), 0.5)
+        grey = _texture(*_hit(rig[name])[1:]) if textured else np.full((HEIGHT, WIDTH, 3), 0.5)
         exposed = 255 * np.clip(grey * EXPOSURES[index % len(EXPOSURES)], 0, 1)
         images[name] = exposed.round().astype(np.uint8)
     return MultiViewFrame(0, 0.0, images)
@@ -74,13 +74,11 @@ def _hit(camera: Camera) -> tuple[NDArray[np.float64], ...]:
     return tuple(values.reshape(HEIGHT, WIDTH) for values in (depth, u, v, which))
 
 
-def _texture(
-    u: NDArray[np.float64], v: NDArray[np.float64], which: NDArray[np.float64], *, seed: int
-) -> NDArray[np.float64]:
+def _texture(u: NDArray[np.float64], v: NDArray[np.float64], which: NDArray[np.float64]) -> NDArray[np.float64]:
     """Smooth noise of three octaves, another one on each plane, ``[H, W, 3]`` in [0, 1]."""
     total = np.zeros((*u.shape, 3))
     for plane in range(3):
-        rng = np.random.default_rng((seed, plane))
+        rng = np.random.default_rng((0, plane))
         value = np.zeros((*u.shape, 3))
         for cell, weight in ((0.3, 0.3), (0.12, 0.4), (0.06, 0.3)):
             lattice = rng.random((64, 64, 3))

@@ -9,13 +9,14 @@ check that its tensors lie together, as on a GPU: only numbers ``[]`` and indice
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
+
+from benchmarks.stages import mapped
 
 # Autograd has no threads for a GPU that is not there; for this device it works on the calling one.
 DEVICE = torch.device("meta")
@@ -154,11 +155,5 @@ def pretended_device(see: Callable[[Any, Any, Any, Any], None] | None = None) ->
 
 
 def moved(value: Value, device: torch.device) -> Value:
-    """``value`` with its tensors on ``device``: one, or those of a dataclass or a named tuple."""
-    if isinstance(value, Tensor):
-        return value.to(device)  # type: ignore[return-value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(moved(part, device) for part in value))  # type: ignore[return-value]
-    return value
+    """``value`` with its tensors on ``device``, as :func:`benchmarks.stages.mapped` finds them."""
+    return mapped(value, lambda tensor: tensor.to(device))

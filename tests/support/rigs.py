@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.evaluation import camera_path
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -18,12 +19,7 @@ from structgstream.scene.scene import Scene
 
 def look_at(eye: Tensor, target: Tensor) -> Tensor:
     """World-to-camera matrix of a camera at ``eye`` that looks at ``target``; world y points down."""
-    z = torch.nn.functional.normalize(target - eye, dim=0)
-    x = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=z.dtype), z), dim=0)
-    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return viewmat
+    return camera_path.look_at(eye, target, torch.tensor([0.0, 1.0, 0.0], dtype=eye.dtype))
 
 
 def arc_rig(cameras: int = 4, *, width: int = 48, height: int = 32, radius: float = 3.0) -> CameraRig:

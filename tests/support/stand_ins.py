@@ -11,14 +11,14 @@ from tests.support import stand_in
 PROGRAM = (PYTHON, "-I", "-S", stand_in.__file__)
 
 
-def job(folder: Path, *, frames: int = 12, group: int = 4, program: tuple[str, ...] = PROGRAM) -> Job:
+def job(folder: Path, *, frames: int = 12, program: tuple[str, ...] = PROGRAM) -> Job:
     """Three groups of four frames."""
-    unit = Unit("capture", frames, track=("--groups", str(group)), program=program)
+    unit = Unit("capture", frames, track=("--groups", "4"), program=program)
     return Job(unit, folder / "out.sgs")
 
 
-def workers(count: int = 2) -> TaskQueue:
-    return TaskQueue(LocalEngine([WorkerSlot(1)] * count))
+def workers() -> TaskQueue:
+    return TaskQueue(LocalEngine([WorkerSlot(1)] * 2))
 
 
 def sha256(path: Path) -> str:

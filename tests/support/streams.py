@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small streams that several tests look at."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -37,12 +37,10 @@ STEPS: dict[str, float] = {p.name: 2.0**-6 for row in STATE_TABLE for p in row.p
 STATIC_STEP = 2.0**-7
 
 
-def compact_header(
-    scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC, steps: Mapping[str, float] = STEPS
-) -> StreamHeader:
+def compact_header(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -> StreamHeader:
     """As :func:`header_for`, with codec ``compact``; ``scene`` is the reference."""
     rows = dynamic - FREE_FIELDS
-    used = {p.name: steps[p.name] for p in parameters_of(dynamic) if p.name in steps}
+    used = {p.name: STEPS[p.name] for p in parameters_of(dynamic) if p.name in STEPS}
     state = state_of(scene)
     reference = dequantize_state(quantize_state(state, rows, used), rows, used)
     init_steps: dict[FieldName, float] = {

@@ -45,17 +45,26 @@ def balls(seconds: float) -> Floats:
     return 0.35 * np.sin(rates * seconds + phases).sum(0)
 
 
+def with_balls(
+    background: NDArray[np.uint8], camera: Camera, seconds: float, *, radius: float = 0.12
+) -> NDArray[np.uint8]:
+    """The balls at an instant in front of a picture ``[H, W, 3]``."""
+    drawn = background.copy()
+    points = balls(seconds) @ camera.viewmat.numpy()[:3, :3].T + camera.viewmat.numpy()[:3, 3]
+    focal, x0, y0 = float(camera.K[0, 0]), float(camera.K[0, 2]), float(camera.K[1, 2])
+    for index in np.argsort(-points[:, 2]):
+        x, y, z = points[index]
+        # Sixteenths of a pixel, so that positions are not rounded; OpenCV's pixel centres are whole numbers.
+        at = [round((focal * x / z + x0 - 0.5) * 16), round((focal * y / z + y0 - 0.5) * 16)]
+        cv2.circle(drawn, at, round(focal * radius / z * 16), (250, 40 * int(index), 20), -1, cv2.LINE_AA, 4)
+    return drawn
+
+
 def picture(
     camera: Camera, seconds: float, background: NDArray[np.uint8], noise: np.random.Generator
 ) -> NDArray[np.uint8]:
     """The room at an instant, ``[H, W, 3]``."""
-    drawn = background.copy()
-    points = balls(seconds) @ camera.viewmat.numpy()[:3, :3].T + camera.viewmat.numpy()[:3, 3]
-    for index in np.argsort(-points[:, 2]):
-        x, y, z = points[index]
-        # Sixteenths of a pixel, so that positions are not rounded; OpenCV's pixel centres are whole numbers.
-        at = [round((150 * x / z + WIDTH / 2 - 0.5) * 16), round((150 * y / z + HEIGHT / 2 - 0.5) * 16)]
-        cv2.circle(drawn, at, round(150 * 0.12 / z * 16), (250, 40 * int(index), 20), -1, cv2.LINE_AA, 4)
+    drawn = with_balls(background, camera, seconds)
     grain = noise.normal(0, 2, drawn.shape)
     return np.clip(drawn + grain, 0, 255).astype(np.uint8)
 

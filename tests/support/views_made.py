@@ -15,9 +15,9 @@ from structgstream.preparation.calibration.keypoints import Keypoints
 Matches = dict[Pair, NDArray[np.uint32]]
 
 
-def cloud(count: int = 150, *, seed: int = 0) -> Floats:
+def cloud(count: int = 150) -> Floats:
     """Points ``[P, 3]`` around the origin."""
-    return np.random.default_rng(seed).uniform(-0.6, 0.6, (count, 3))
+    return np.random.default_rng(0).uniform(-0.6, 0.6, (count, 3))
 
 
 def keypoints_of(rig: Mapping[str, LensCamera], points: Floats, *, noise: float = 0.0) -> dict[str, Keypoints]:

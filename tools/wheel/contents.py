@@ -17,9 +17,9 @@ BESIDE = (".dist-info/", ".libs/")
 """Folders of a wheel that are no package: its description, and the libraries that were grafted."""
 
 
-def sources(root: Path = ROOT) -> set[str]:
+def sources() -> set[str]:
     """Every file of the package in the repository, as a wheel names it."""
-    source = root / "src"
+    source = ROOT / "src"
     files = (path for path in (source / "structgstream").rglob("*") if path.is_file())
     return {path.relative_to(source).as_posix() for path in files if not {"__pycache__", "_native"} & set(path.parts)}
 

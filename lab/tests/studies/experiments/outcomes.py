@@ -32,7 +32,6 @@ def outcome(
     stream: Mapping[str, Any] | None = None,
     frames: Sequence[Mapping[str, Any]] = (),
     capture: Mapping[str, Any] | None = None,
-    trained_by: Mapping[str, Any] | None = None,
 ) -> Result:
     """A result of ``key`` on a capture called ring, unless ``capture`` says otherwise."""
     machine = {"commit": "abc1234", "cpu": "a processor", "gpu": None, "threads": 1, "cores": 4, "torch": "2.0"}
@@ -49,7 +48,7 @@ def outcome(
         stream=dict(stream or {}),
         frames=list(frames) or [{"index": i, "psnr": psnr} for i in range(3)],
         environment=machine,
-        trained_by={**machine, **(trained_by or {})},
+        trained_by=machine,
     )
 
 

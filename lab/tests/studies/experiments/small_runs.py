@@ -19,9 +19,9 @@ def quick(*, seed: int = 0) -> StreamConfig:
     return replace(TINY_RIG, seed=seed, points=FEW_POINTS, initial=initial, online=online)
 
 
-def compact(*, seed: int = 0) -> StreamConfig:
+def compact() -> StreamConfig:
     """The preset compact with as few iterations."""
-    few = quick(seed=seed)
+    few = quick()
     patching = replace(COMPACT.online.patching, iteration=few.online.patching.iteration)
     online = replace(COMPACT.online, iterations=few.online.iterations, patching=patching)
     whole = COMPACT.initial
@@ -33,4 +33,4 @@ def compact(*, seed: int = 0) -> StreamConfig:
         all_drawn=whole.all_drawn,
         floaters=whole.floaters,
     )
-    return replace(COMPACT, seed=seed, points=few.points, initial=initial, online=online)
+    return replace(COMPACT, seed=few.seed, points=few.points, initial=initial, online=online)
