@@ -2,7 +2,6 @@
 import logging
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
@@ -11,6 +10,7 @@ from structgstream.errors import CaptureError
 from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.footage import find_footage, shared_seconds, shots_of, spread_moments
 from tests.support.captures import numbers, picture, write_picture, write_video, write_videos
+from tests.support.sounds import add_sound
 
 
 def test_videos_in_natural_order(tmp_path: Path) -> None:
@@ -53,29 +53,15 @@ def test_folders_of_pictures_and_single_pictures(tmp_path: Path) -> None:
     assert one.only(["cam2", "cam0"]).cameras == ("cam0", "cam2")
 
 
-def write_sound(path: Path, *, delay_seconds: float) -> None:
-    """A click at second 0.2 of the pictures' clock; the sound begins late."""
-    with av.open(str(path), "w") as container:
-        video = container.add_stream("libx264", rate=30)
-        video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
-        sound = container.add_stream("pcm_s16le", rate=48_000)
-        for number in range(30):
-            frame = av.VideoFrame.from_ndarray(picture(0, number), format="rgb24")
-            frame.pts = number
-            container.mux(video.encode(frame))
-        container.mux(video.encode())
-        samples = np.zeros((1, 24_000), np.int16)
-        samples[0, round((0.2 - delay_seconds) * 48_000)] = 30_000
-        audio = av.AudioFrame.from_ndarray(samples, format="s16", layout="mono")
-        audio.sample_rate, audio.pts = 48_000, round(delay_seconds * 48_000)
-        container.mux(sound.encode(audio))
-        container.mux(sound.encode())
-
-
 @pytest.mark.parametrize("delay_seconds", [0.0, 0.1])
 def test_sound_is_on_the_pictures_clock(tmp_path: Path, delay_seconds: float) -> None:
-    write_sound(tmp_path / "a.mkv", delay_seconds=delay_seconds)
-    found = find_footage(tmp_path).audio("a")
+    """A click at second 0.2 of the pictures' clock; the sound begins late."""
+    write_video(tmp_path / "silent.mp4", [picture(0, number) for number in range(30)])
+    click = np.zeros((1, SAMPLE_RATE // 2), np.float32)
+    click[0, round((0.2 - delay_seconds) * SAMPLE_RATE)] = 0.9
+    (tmp_path / "take").mkdir()
+    add_sound(tmp_path / "silent.mp4", tmp_path / "take" / "a.mkv", click, start=delay_seconds, codec="pcm_f32le")
+    found = find_footage(tmp_path / "take").audio("a")
     assert found is not None
     assert np.abs(found).argmax() / SAMPLE_RATE == pytest.approx(0.2, abs=0.002)
 

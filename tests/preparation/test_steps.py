@@ -2,7 +2,6 @@
 """The steps up to a calibration and from it to a capture: what each depends on, and what is done again."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.output_folder import FOLDER, SOURCE, Silent, Steps
 from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method
 from structgstream.preparation.solvers import TIMESTAMPS, Clocks, given_cameras
+from tests.support.calibrations import opencv_matrix
 from tests.support.footage_made import still_room
 from tests.support.rooms import write_room
 
@@ -149,8 +149,10 @@ def test_a_calibration_of_two_files_is_read_again_when_the_second_changes(room: 
     names = sorted(video.stem for video in videos.glob("*.mp4"))
     intri, extri = (["%YAML:1.0", "---", "names:", *(f'  - "{name}"' for name in names)] for _ in range(2))
     for number, name in enumerate(names):
-        intri += matrix(f"K_{name}", 3, (150, 0, 80, 0, 150, 60, 0, 0, 1)) + matrix(f"D_{name}", 5, (0.0,) * 5)
-        extri += matrix(f"R_{name}", 1, (0.0,) * 3) + matrix(f"T_{name}", 1, (0.5 * number, 0.0, 0.0))
+        K = [[150, 0, 80], [0, 150, 60], [0, 0, 1]]
+        intri += [opencv_matrix(f"K_{name}", K), opencv_matrix(f"D_{name}", [0.0] * 5)]
+        place = np.array([[0.5 * number], [0.0], [0.0]])
+        extri += [opencv_matrix(f"R_{name}", 0 * place), opencv_matrix(f"T_{name}", place)]
     (videos / "intri.yml").write_text("\n".join(intri) + "\n")
     (videos / "extri.yml").write_text("\n".join(extri) + "\n")
     _, before = run(job(videos, tmp_path / "out"))
@@ -161,15 +163,6 @@ def test_a_calibration_of_two_files_is_read_again_when_the_second_changes(room: 
     _, after = run(job(videos, tmp_path / "out"))
     assert float(before.cameras["cam03"].camera.viewmat[0, 3]) == 1.5
     assert float(after.cameras["cam03"].camera.viewmat[0, 3]) == 2.5
-
-
-def matrix(key: str, columns: int, values: Sequence[float]) -> list[str]:
-    """A matrix as OpenCV's storage writes it; one column for vectors."""
-    rows, columns = (len(values) // columns, columns) if columns > 1 else (len(values), 1)
-    data = ", ".join(str(float(value)) for value in values)
-    return [
-        f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]",
-    ]  # fmt: skip
 
 
 NEAR = PrepareOptions(synchronize="none", near=0.25)

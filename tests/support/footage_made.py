@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.board import Board
 from tests.support.captures import write_video
-from tests.support.filmed import Film, board_plane, ring, room, turned
+from tests.support.filmed import Film, Plane, board_plane, ring, room, turned
 from tests.support.sounds import add_sound
 from tests.support.takes import with_balls
 
@@ -45,17 +45,23 @@ def write_take(folder: Path, *, starts: Sequence[int], frames: int) -> dict[str,
     return rig
 
 
-def write_board_take(folder: Path, rig: Mapping[str, LensCamera], *, instants: int, period: float) -> None:
-    """Videos in which the board is carried through the middle, a picture each ``period`` seconds."""
+def carried_board(instants: int, *, reach: float = 0.3, far: float = 0.3) -> list[Plane]:
+    """The board near the middle, tilted at random: up to ``reach`` across, down and up to ``far`` behind it."""
     generator = np.random.default_rng(3)
     planes = []
     for _ in range(instants):
         yaw, pitch, roll = generator.uniform([-40, -35, -25], [40, 35, 25])
         pose = np.eye(4)
         pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0) @ turned(roll, axis=2)
-        middle = generator.uniform([-0.3, -0.3, -0.45], [0.3, 0.3, 0.3])
+        middle = generator.uniform([-reach, -reach, -0.45], [reach, reach, far])
         pose[:3, 3] = middle - pose[:3, :3] @ [*(side / 2 for side in BOARD.size_metres), 0.0]
         planes.append(board_plane(BOARD, pose))
+    return planes
+
+
+def write_board_take(folder: Path, rig: Mapping[str, LensCamera], *, instants: int, period: float) -> None:
+    """Videos in which the board is carried through the middle, a picture each ``period`` seconds."""
+    planes = carried_board(instants)
     for name, filmed in rig.items():
         film = Film(filmed)
         shots = [film.picture([plane], noise=1.5, seed=index) for index, plane in enumerate(planes)]

@@ -19,9 +19,9 @@ from structgstream.preparation.calibration.board_solving import Sightings, adjus
 from structgstream.preparation.calibration.lens_terms import LensModel
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from tests.support.calibration_errors import calibration_errors
-from tests.support.filmed import Film, board_plane, ring, turned
+from tests.support.filmed import Film, ring, turned
+from tests.support.footage_made import BOARD, carried_board
 
-BOARD = Board(7, 5, 0.12)
 INSTANTS = 16
 LENSES: dict[LensModel, tuple[Lens, float, tuple[int, int]]] = {
     "pinhole": (Pinhole(), 300.0, (360, 270)),
@@ -36,16 +36,7 @@ def filmed(model: LensModel) -> tuple[dict[str, LensCamera], Pictures]:
     """Three cameras, and their pictures of the board near them, tilted at random."""
     lens, focal, size = LENSES[model]
     rig = ring(3, radius=1.1, arc_degrees=50, focal=focal, lens=lens, size=size)
-    generator = np.random.default_rng(3)
-    reach = 0.45 if model == "fisheye" else 0.3
-    planes = []
-    for _ in range(INSTANTS):
-        yaw, pitch, roll = generator.uniform([-40, -35, -25], [40, 35, 25])
-        pose = np.eye(4)
-        pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0) @ turned(roll, axis=2)
-        middle = generator.uniform([-reach, -reach, -0.45], [reach, reach, 0.0 if model == "fisheye" else 0.3])
-        pose[:3, 3] = middle - pose[:3, :3] @ [*(side / 2 for side in BOARD.size_metres), 0.0]
-        planes.append(board_plane(BOARD, pose))
+    planes = carried_board(INSTANTS, reach=0.45, far=0.0) if model == "fisheye" else carried_board(INSTANTS)
     films = {name: Film(camera) for name, camera in rig.items()}
     return rig, {
         name: [film.picture([plane], noise=1.5, seed=index) for index, plane in enumerate(planes)]

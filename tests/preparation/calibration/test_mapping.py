@@ -4,16 +4,12 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.matching import connected_groups
 from structgstream.preparation.calibration import mapping
 from structgstream.preparation.calibration.bundle import adjust_together
 from structgstream.preparation.calibration.colmap import colmap_cameras
@@ -36,12 +32,10 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 from tests.support import repetitive
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import ring
-from tests.support.properties import examples
 from tests.support.views_made import cloud, keypoints_of, matches_of
 
 THREE = ring(3, radius=2.6, arc_degrees=40)
 CAMERAS = colmap_cameras(THREE)
-NAMES = [f"cam{number}" for number in range(6)]
 
 
 def test_true_matches_are_kept_and_wrong_ones_go() -> None:
@@ -78,21 +72,6 @@ def test_pairs_that_agree_by_chance_or_in_a_few_points_do_not_pass() -> None:
         CAMERAS,
     )
     assert set(found) == {("cam01", "cam02")}
-
-
-@examples(60)
-@given(st.sets(st.sampled_from(list(combinations(NAMES, 2)))))
-def test_groups_are_what_pairs_connect(pairs: set[tuple[str, str]]) -> None:
-    """A pair lies in one group, no smaller groups would do, and the largest comes first."""
-    groups = connected_groups(NAMES, sorted(pairs))
-    assert sorted(name for group in groups for name in group) == NAMES
-    assert [len(group) for group in groups] == sorted(map(len, groups), reverse=True)
-    assert all(list(group) == sorted(group) for group in groups)
-    for group in groups:
-        reached = {group[0]}
-        while more := {name for pair in pairs if reached & set(pair) for name in pair} - reached:
-            reached |= more
-        assert reached == set(group)
 
 
 RIG = ring(5, radius=2.6, arc_degrees=80)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from structgstream.data.matching import project
+from structgstream.data.matching import connected_groups, project
 from structgstream.pose_check.tracks import build_tracks
 from structgstream.preparation.checking.overlap import (
     cameras_per_point,
@@ -51,6 +51,9 @@ def test_groups_are_those_of_the_graph(pairs: set[tuple[str, str]]) -> None:
     apart = [finding for finding in findings if "no matches" in finding.sentence]
     reported = [set(finding.cameras) for finding in apart]
     groups = [{name for name, own in zip(NAMES, label, strict=True) if own == group} for group in range(count)]
+    found = connected_groups(NAMES, sorted(pairs))
+    assert sorted(found) == sorted(tuple(sorted(group)) for group in groups)
+    assert [len(group) for group in found] == sorted(map(len, found), reverse=True)
     single = [group for group in groups if len(group) == 1]
     together = set().union(*single)
     assert len(reported) == count - 1 - max(len(single) - 1, 0)

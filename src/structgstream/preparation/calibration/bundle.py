@@ -226,8 +226,8 @@ NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
 
 def inlier_pixels(longest_side: int) -> float:
-    """Largest reprojection error of what stays, pixels: three of pictures of 1000 pixels on the longer side, in
-    proportion, and never under one."""
+    """Largest reprojection error of what stays, and epipolar distance of a match that agrees, pixels: three of pictures
+    of 1000 pixels on the longer side, in proportion, and never under one."""
     return max(1.0, MAX_PIXELS * longest_side / 1000)
 
 

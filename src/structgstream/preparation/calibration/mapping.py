@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.geometry import Indices
-from structgstream.preparation.calibration.bundle import MIN_DEGREES, chosen
+from structgstream.preparation.calibration.bundle import MIN_DEGREES, chosen, inlier_pixels
 from structgstream.preparation.calibration.colmap import colmap_cameras, colmap_pose, filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
     Keypoints,
@@ -35,8 +35,6 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 
 Matches = Mapping[Pair, NDArray[np.uint32]]
 
-
-MAX_PIXELS = 3.0  # epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1
 MIN_MATCHES = 20  # that agree
 MIN_SHARE = 0.3
 """Smallest share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have some matches that
@@ -57,7 +55,7 @@ def verified_pairs(keypoints: Mapping[str, Keypoints], matches: Matches, cameras
         options.compute_relative_pose = True
         options.ransac.random_seed = 0
         options.ransac.max_num_trials = MAX_TRIALS
-        options.ransac.max_error = max(1.0, MAX_PIXELS * max(one.width, one.height, two.width, two.height) / 1000)
+        options.ransac.max_error = inlier_pixels(max(one.width, one.height, two.width, two.height))
         return pycolmap.estimate_two_view_geometry(
             one, keypoints[pair[0]].pixels, two, keypoints[pair[1]].pixels, matches[pair], options
         )

@@ -114,6 +114,6 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     """
     one, other = (solved.cameras[name].camera.center.numpy() for name in (first, second))
     distance = float(np.linalg.norm(other - one))
-    if not metres > 0 or first == second or distance == 0:
+    if not metres > 0 or distance == 0:
         raise CalibrationError(f"A distance of {metres:g} m between {first!r} and {second!r} gives no scale.")
     return solved.aligned(Alignment(metres / distance, np.eye(3), np.zeros(3)), metres=True)

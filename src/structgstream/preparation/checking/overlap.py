@@ -82,7 +82,6 @@ MIN_POINTS = 30
 CUT_SHARE = 0.02
 CLOSEST_NEAR = 0.0007  # of the depth of the nearest points: a near plane any closer looks like one in another unit
 PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
-FACTORS = (1000.0, 0.001, 100.0, 0.01)
 UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000 times too large (millimetres among "
          "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
          "among metres)"}  # fmt: skip
@@ -159,7 +158,7 @@ def _foreign_points(points: Floats, depths: Floats, cameras: Mapping[str, Camera
     extent = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
     differences = {
         factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
-        for factor in FACTORS
+        for factor in UNITS
         if factor * extent > MIN_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
     }
     likely = min(differences, key=lambda factor: differences[factor], default=None)
