@@ -34,17 +34,11 @@ def test_no_more_directions_than_features() -> None:
     assert state_of(with_appearance(scene, 1000))["appearance_basis"].shape == (scene.anchors.features.shape[1],) * 2
 
 
-def test_features_are_f_v_and_the_appearance() -> None:
-    dressed = with_appearance(random_scene(), 2)
-    z = torch.randn(len(dressed.anchors), 2, generator=torch.Generator().manual_seed(0))
-    moved = replace(dressed, anchors=replace(dressed.anchors, appearance=z))
-    torch.testing.assert_close(moved.features, dressed.anchors.features + z @ state_of(dressed)["appearance_basis"])
-
-
-def test_baked_it_looks_the_same() -> None:
+def test_features_are_f_v_and_the_appearance_which_may_be_folded_into_them() -> None:
     dressed = with_appearance(random_scene(free=3), 4)
-    appearance = torch.randn(len(dressed.anchors), 4, generator=torch.Generator().manual_seed(0))
-    changed = replace(dressed, anchors=replace(dressed.anchors, appearance=appearance))
+    z = torch.randn(len(dressed.anchors), 4, generator=torch.Generator().manual_seed(0))
+    changed = replace(dressed, anchors=replace(dressed.anchors, appearance=z))
+    torch.testing.assert_close(changed.features, dressed.anchors.features + z @ state_of(dressed)["appearance_basis"])
     folded = changed.with_folded_appearance()
     assert torch.equal(folded.features, changed.features)
     assert folded.appearance_basis is None

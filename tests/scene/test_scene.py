@@ -4,6 +4,7 @@ from dataclasses import replace
 import torch
 
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.color import CameraColor
 from tests.support.rigs import arc_rig, random_scene
 
 
@@ -45,3 +46,21 @@ def test_without_the_distance_input_the_distance_does_not_matter() -> None:
     )
     camera = arc_rig()["cam01"]
     assert len(narrow.gaussians(camera, reference_backend())) > 0
+
+
+def test_the_gauge_is_exact_and_keeps_differences() -> None:
+    color = CameraColor(gains=torch.rand(5, 3) + 0.5, biases=torch.rand(5, 3) - 0.5)
+    gauged = color.gauged()
+    assert torch.allclose(gauged.gains.mean(0), torch.ones(3))
+    assert torch.allclose(gauged.biases.mean(0), torch.zeros(3), atol=1e-6)
+    assert torch.allclose(gauged.gains[1] - gauged.gains[0], color.gains[1] - color.gains[0])
+
+
+def test_rows_keep_their_identity() -> None:
+    free = random_scene(free=5).free
+    kept = free.select(torch.tensor([True, False, True, False, True]))
+    assert kept.births.tolist() == [0, 2, 4]
+    assert torch.equal(kept.means, free.means[::2])
+    both = kept.append(free)
+    assert len(both) == 8
+    assert both.births.tolist() == [0, 2, 4, 0, 1, 2, 3, 4]

@@ -21,15 +21,17 @@ from structgstream.scene.state import (
     with_dynamic_fields,
 )
 from tests.support.rigs import random_scene
+from tests.support.streams import same
 
 
-def test_state_and_scene_are_inverse() -> None:
+@pytest.mark.parametrize("options", [(), ("appearance", "environment")])
+def test_state_and_scene_are_inverse(options: tuple[str, ...]) -> None:
     scene = random_scene(free=4)
+    if options:
+        scene = replace(with_appearance(scene, 3), environment=torch.rand(9, 3))
     state = state_of(scene)
-    again = state_of(scene_of(state, distance_input=True))
-    assert set(state) == {f.name for f in STATE_TABLE if not f.optional}
-    for name, value in state.items():
-        assert torch.equal(again[name], value), name
+    assert set(state) == {row.name for row in STATE_TABLE if row.optional is None or row.optional in options}
+    assert same(scene_of(state, distance_input=True), scene)
 
 
 def test_codes_and_names_are_never_shared() -> None:
@@ -76,18 +78,3 @@ def test_size_of_the_covariance_mlp() -> None:
     state = state_of(random_scene(free=3))
     assert state["covariance_mlp"].numel() == 32 * 36 + 32 + 35 * 32 + 35 == 2339
     assert state["free"].shape == (3, FREE_COLUMNS)
-
-
-def test_appearance_and_environment_are_in_the_state_of_scenes_that_have_them() -> None:
-    scene = replace(with_appearance(random_scene(free=4), 3), environment=torch.rand(9, 3))
-    state = state_of(scene)
-    assert {
-        "appearance",
-        "appearance_basis",
-        "environment",
-        *(row.name for row in STATE_TABLE if row.optional is None),
-    } == set(state)
-    assert state["appearance"].shape == (len(scene.anchors), 3)
-    again = state_of(scene_of(state, distance_input=True))
-    for name, value in state.items():
-        assert torch.equal(again[name], value), name

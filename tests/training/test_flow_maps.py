@@ -13,8 +13,14 @@ from structgstream.training.online.preprocess import FlowMaps, _parts, flow_map
 from tests.support.backends import quickest_backend
 
 
-def search(*given) -> torch.Tensor:
-    return flow_map(*given, backend=quickest_backend()).maps
+def search(
+    first: np.ndarray, second: np.ndarray, *, changed: torch.Tensor | None = None, size: tuple[int, int] | None = None
+) -> torch.Tensor:
+    """Flow maps of ``size``, or that of the pictures, which changed where they differ unless ``changed`` is given."""
+    if changed is None:
+        changed = torch.from_numpy((first != second).any(2))
+    pictures = torch.from_numpy(first), torch.from_numpy(second)
+    return flow_map(*pictures, changed, size or first.shape[:2], backend=quickest_backend()).maps
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -26,8 +32,7 @@ def test_a_shifted_patch_is_reported_at_half_the_size_in_whole_pixels() -> None:
     first = textured()
     second = first.copy()
     second[40:80, 56:106] = first[40:80, 50:100]  # six to the right
-    changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
-    maps = search(torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
+    maps = search(first, second, size=(60, 80))
     assert maps.shape == (60, 80, 3)
     inner = maps[24:36, 30:45]
     confidence, flow = inner[..., 0], inner[..., 1:] / inner[..., :1].clamp(min=1e-6)
@@ -37,18 +42,16 @@ def test_a_shifted_patch_is_reported_at_half_the_size_in_whole_pixels() -> None:
 
 def test_beyond_the_box_around_what_changed_there_is_no_flow() -> None:
     first = textured()
-    second = np.roll(first, 3, 1)
     changed = torch.zeros(120, 160, dtype=torch.bool)
     changed[50:70, 60:90] = True
-    maps = search(torch.from_numpy(first), torch.from_numpy(second), changed, (120, 160))
+    maps = search(first, np.roll(first, 3, 1), changed=changed)
     assert maps[50:70, 60:90, 0].mean() > 0.8
     assert not maps[:30].any()
     assert not maps[:, :40].any()
 
 
 def test_nothing_changed_is_no_flow() -> None:
-    picture = torch.from_numpy(textured())
-    assert not search(picture, picture, torch.zeros(120, 160, dtype=torch.bool), (60, 80)).any()
+    assert not search(textured(), textured(), size=(60, 80)).any()
 
 
 def test_parts_that_changed_are_searched_apart() -> None:
@@ -56,9 +59,7 @@ def test_parts_that_changed_are_searched_apart() -> None:
     second = first.copy()
     second[24:56, 36:76] = first[24:56, 32:72]  # four to the right, up on the left
     second[140:172, 250:290] = first[146:178, 250:290]  # six up, down on the right
-    changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
-    pictures = torch.from_numpy(first), torch.from_numpy(second)
-    maps = search(*pictures, changed, (192, 320))
+    maps = search(first, second)
     left, right = (slice(32, 50), slice(44, 66)), (slice(152, 166), slice(262, 278))
     for (rows, columns), flow in ((left, [4.0, 0.0]), (right, [0.0, -6.0])):
         found = maps[rows, columns]
@@ -70,11 +71,10 @@ def test_parts_that_changed_are_searched_apart() -> None:
 
 def test_parts_near_each_other_are_searched_together() -> None:
     first = textured()
-    second = np.roll(first, 2, 1)
     changed = torch.zeros(120, 160, dtype=torch.bool)
     changed[40:60, 40:60] = changed[40:60, 90:110] = True
-    pictures = torch.from_numpy(first), torch.from_numpy(second)
-    assert search(*pictures, changed, (120, 160))[45:55, 65:85, 0].mean() > 0.9, "also between the two"
+    maps = search(first, np.roll(first, 2, 1), changed=changed)
+    assert maps[45:55, 65:85, 0].mean() > 0.9, "also between the two"
 
 
 WIDTHS = pytest.mark.parametrize("width", [320, 960, 1920])

@@ -8,7 +8,6 @@ import torch
 
 from structgstream.groups import first_frame
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
-from structgstream.scene.state import state_of
 from structgstream.training.online.config import (
     MotionConfig,
     OnlineConfig,
@@ -24,6 +23,7 @@ from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.residuals import baseline_residual
 from tests.support.backends import quickest_backend
+from tests.support.streams import same
 from tests.support.varied import varied
 from tests.support.worlds import World, moving_world
 
@@ -90,9 +90,7 @@ def test_it_has_the_iterations_of_eleven_online_frames_unless_asked() -> None:
 
 def test_what_does_not_change_keeps_the_bits_of_frame_0() -> None:
     world = scenery(movers=0)
-    found = fit(world, truth(world, 0))
-    before, after = state_of(world.scene), state_of(found.scene)
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert same(fit(world, truth(world, 0)).scene, world.scene)
 
 
 def test_changes_are_priced_against_frame_0() -> None:

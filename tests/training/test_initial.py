@@ -9,12 +9,12 @@ import torch
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import state_of
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, in_free_space
 from structgstream.training.frame0.seeding import seeded_scene, voxel_centers
 from tests.support.backends import quickest_backend
+from tests.support.streams import same
 from tests.support.varied import varied
 from tests.support.worlds import moving_world, psnr
 
@@ -113,8 +113,7 @@ def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_chan
 def test_the_same_seed_gives_the_same_bits() -> None:
     world = moving_world(1)
     config = replace(QUICK, iterations=25)
-    one, two = (state_of(fit(world, config=config).scene) for _ in range(2))
-    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert same(*(fit(world, config=config).scene for _ in range(2)))
 
 
 def test_rates_of_the_reference_schedule() -> None:

@@ -2,31 +2,16 @@
 import math
 
 import pytest
-import torch
 
-from structgstream.scene.color import CameraColor
-from structgstream.training.losses import LossWeights, ViewLoss, picture_loss
+from structgstream.training.losses import ViewLoss
 from structgstream.training.optim import LastPass
-from structgstream.training.result import Stopwatch
+from structgstream.training.parameters import Parameters
 from structgstream.training.views import View
-from tests.support.backends import quickest_backend
-from tests.support.rigs import arc_rig, random_scene
+from tests.support.rigs import random_scene
+from tests.training.test_step import loss_of
 
-BACKEND = quickest_backend()
-
-
-def loss_of(grey: int, index: int = 0) -> tuple[ViewLoss, View]:
-    scene, view = random_scene(), View(index, arc_rig()["cam01"], torch.full((32, 48, 3), grey, dtype=torch.uint8))
-    loss = picture_loss(
-        scene.gaussians(view.camera, BACKEND),
-        view,
-        CameraColor.identity(3, scene.anchors.positions),
-        backend=BACKEND,
-        weights=LossWeights(),
-        track_screen=False,
-        watch=Stopwatch(),
-    )
-    return loss, view
+SCENE = random_scene()
+PARAMETERS = Parameters.of(SCENE, trained=frozenset())
 
 
 def psnr(loss: ViewLoss, view: View) -> float:
@@ -35,7 +20,8 @@ def psnr(loss: ViewLoss, view: View) -> float:
 
 
 def test_the_last_pass_reports_psnr_in_decibels_and_terms() -> None:
-    (dark, first), (bright, second) = loss_of(90), loss_of(200, index=1)
+    dark, first = loss_of(PARAMETERS, SCENE, grey=90)
+    bright, second = loss_of(PARAMETERS, SCENE, grey=200, index=1)
     last = LastPass()
     assert math.isnan(last.psnr)
     last.add(1, dark, first)
@@ -47,7 +33,7 @@ def test_the_last_pass_reports_psnr_in_decibels_and_terms() -> None:
 
 def test_terms_of_other_tiles_are_left_out() -> None:
     """A visit of changed tiles alone has another l1; the last visit of all of them counts."""
-    (dark, view), (bright, _) = loss_of(90), loss_of(200)
+    (dark, view), (bright, _) = (loss_of(PARAMETERS, SCENE, grey=grey) for grey in (90, 200))
     last = LastPass(after=4, terms_after=2)
     last.add(2, bright, view)
     assert last.terms == {}
@@ -58,7 +44,7 @@ def test_terms_of_other_tiles_are_left_out() -> None:
 
 
 def test_a_view_counts_once_and_what_came_before_does_not() -> None:
-    (dark, view), (bright, _) = loss_of(90), loss_of(200)
+    (dark, view), (bright, _) = (loss_of(PARAMETERS, SCENE, grey=grey) for grey in (90, 200))
     last = LastPass(after=4)
     last.add(4, bright, view)
     assert math.isnan(last.psnr)

@@ -19,13 +19,14 @@ from tests.support.backends import on_each_backend, quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import emerging_ball, moved_since, moving_world
 
+BACKEND = quickest_backend()
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
 CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2, planes=96))  # so small a ball needs more depths
 
 
 def renewed(
-    backend: Backend,
     *,
+    backend: Backend = BACKEND,
     scene: Scene = WORLD.scene,
     config: SpawnConfig = CONFIG,
     room: int = 1000,
@@ -50,7 +51,7 @@ def renewed(
 
 @on_each_backend
 def test_an_emerging_ball_is_spawned_where_it_is(build: Callable[[], Backend]) -> None:
-    found, ball = renewed(build()), emerging_ball(0.95)
+    found, ball = renewed(backend=build()), emerging_ball(0.95)
     spawned = found.new_free
     assert len(spawned) >= 3
     assert not found.refused
@@ -62,13 +63,12 @@ def test_an_emerging_ball_is_spawned_where_it_is(build: Callable[[], Backend]) -
 
 
 def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_floor_is_eased() -> None:
-    scene, backend = WORLD.scene, quickest_backend()
-    baseline = baseline_residual(scene, WORLD.views(), scale=1.0, backend=backend)
+    baseline = baseline_residual(WORLD.scene, WORLD.views(), scale=1.0, backend=BACKEND)
     bad = replace(baseline, maps={i: torch.full_like(of_view, 0.02) for i, of_view in baseline.maps.items()})
     for of_view in bad.maps.values():
         of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
     spawned = [
-        len(renewed(backend, baseline=bad, config=varied(CONFIG, BASELINE_CAP_MEDIANS=medians)).new_free)
+        len(renewed(baseline=bad, config=varied(CONFIG, BASELINE_CAP_MEDIANS=medians)).new_free)
         for medians in (1e9, 1.0)
     ]
     assert spawned[0] == 0
@@ -83,31 +83,31 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr(Sweep, "_draw", counting)
-    assert not len(renewed(quickest_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
+    assert not len(renewed(config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
-    assert len(renewed(quickest_backend()).new_free)
+    assert len(renewed().new_free)
     assert drawn, "where something is missing it is"
 
 
 def test_spawning_keeps_to_the_room_there_is() -> None:
-    everything = renewed(quickest_backend())
-    few = renewed(quickest_backend(), config=replace(CONFIG, most=2))
+    everything = renewed()
+    few = renewed(config=replace(CONFIG, most=2))
     assert len(few.new_free) == 2
     assert float(few.new_free.log_scales.min()) > float(everything.new_free.log_scales.max()), "they are coarser"
     assert few.counts["merged"] == len(everything.new_free) - 2, "which the log reports"
-    assert len(renewed(quickest_backend(), room=1).new_free) == 1
-    assert len(renewed(quickest_backend(), room=0).new_free) == 0
+    assert len(renewed(room=1).new_free) == 1
+    assert len(renewed(room=0).new_free) == 0
     assert len(everything.new_free) > 2
 
 
 def test_off_nothing_is_spawned() -> None:
-    found = renewed(quickest_backend(), config=replace(CONFIG, enabled=False))
+    found = renewed(config=replace(CONFIG, enabled=False))
     assert len(found.new_free) == 0
     assert found.kept.all()
 
 
 def test_when_everything_is_missing_nothing_is_spawned_and_that_is_reported() -> None:
-    found = renewed(quickest_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
+    found = renewed(config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0
 
@@ -118,7 +118,7 @@ def test_a_ghost_dies() -> None:
     look = ghost.scales.log(), ghost.colors
     places = ghost.means + torch.tensor([[0.5, 0.0, 0.0]])
     free = FreeGaussians.spawned(places, *look, opacity=0.95, first_identity=3)
-    found = renewed(quickest_backend(), scene=replace(WORLD.scene, free=free), residual_threshold=0.05)
+    found = renewed(scene=replace(WORLD.scene, free=free), residual_threshold=0.05)
     assert found.kept.tolist() == [False], "what is wrong is dynamic"
 
 
@@ -138,8 +138,8 @@ THIN = varied(
 
 
 def test_what_the_first_sweep_does_not_see_the_second_one_bears() -> None:
-    assert not len(renewed(quickest_backend(), config=BLIND).new_free)
-    found = renewed(quickest_backend(), config=replace(BLIND, thin=THIN))
+    assert not len(renewed(config=BLIND).new_free)
+    found = renewed(config=replace(BLIND, thin=THIN))
     assert found.thin_count == len(found.new_free) > 0
     ball = emerging_ball(0.95)
     near = (found.new_free.means - ball.means).norm(dim=1)
@@ -147,22 +147,20 @@ def test_what_the_first_sweep_does_not_see_the_second_one_bears() -> None:
 
 
 def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
-    alone, both = (renewed(quickest_backend(), config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
+    alone, both = (renewed(config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
     assert torch.equal(alone.new_free.means, both.new_free.means)
     assert both.thin_count == 0
 
 
 def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_content() -> None:
     """In a throw everything that lags would be spawned, and stand where anchors belong."""
-    number = len(renewed(quickest_backend(), config=replace(BLIND, thin=THIN)).new_free)
+    number = len(renewed(config=replace(BLIND, thin=THIN)).new_free)
     for most, spawned in ((number, number), (number - 1, 0)):
-        found = renewed(
-            quickest_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
-        )
+        found = renewed(config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most))))
         assert len(found.new_free) == found.thin_count == spawned
         assert found.counts["refused thin"] == number - spawned, "counted in the log"
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
     few = varied(THIN, RULES=replace(THIN.RULES, max_missing_share=1e-4))
-    assert not len(renewed(quickest_backend(), config=replace(BLIND, thin=few)).new_free)
+    assert not len(renewed(config=replace(BLIND, thin=few)).new_free)

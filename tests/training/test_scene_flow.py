@@ -6,7 +6,7 @@ import torch
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import flow_views
 from structgstream.training.online.scene_flow import apply_scene_flow
-from structgstream.training.online.split import DynamicSplit, with_displacements
+from structgstream.training.online.split import DynamicSplit
 from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moved_since, moving_world
 
@@ -61,12 +61,6 @@ def test_off_everything_begins_where_its_prior_says() -> None:
     assert not start.displacements.any()
     assert start.counts == {"displaced": 0, "corrected": 0, "fast": 0, "fast displaced": 0}
     assert start.active_tiles
-
-
-def test_displaced_moves_anchors_and_free_gaussians() -> None:
-    scene = world().scene
-    by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)
-    assert torch.equal(with_displacements(scene, by).anchors.positions, scene.anchors.positions + by)
 
 
 def test_flow_is_looked_for_in_turns_where_there_are_many_views() -> None:

@@ -21,6 +21,11 @@ def seeded(points: torch.Tensor, **options):
     return seeded_scene(points, **{**defaults, **options})
 
 
+def drawn(head: HeadWeights, inputs: torch.Tensor) -> torch.Tensor:
+    """Which Gaussians of anchors with these ``inputs`` of F_alpha have a positive opacity."""
+    return torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2 > 0
+
+
 def test_one_anchor_a_voxel() -> None:
     points = torch.tensor([[0.01, 0.0, 0.0], [0.04, -0.04, 0.02], [0.09, 0.0, 0.0]])
     centers = voxel_centers(points, 0.1)
@@ -45,33 +50,27 @@ def test_the_start_is_neutral() -> None:
 
 
 def test_every_gaussian_can_begin_drawn_whatever_camera_looks() -> None:
-    points, drawn = torch.rand(300, 3), {}
+    points, shares = torch.rand(300, 3), {}
     for wanted in (False, True):
         heads = [
             seeded(points, all_drawn=wanted, generator=torch.Generator().manual_seed(n)).mlps.opacity for n in range(5)
         ]
         inputs = torch.cat([torch.zeros(64, 32), torch.randn(64, 4)], dim=1)
-        drawn[wanted] = [(torch.relu(inputs @ h.w1.T + h.b1) @ h.w2.T + h.b2 > 0).float().mean() for h in heads]
-    assert min(drawn[True]) == 1.0
-    assert max(drawn[False]) < 1.0, "as Scaffold-GS draws them, some begin transparent"
+        shares[wanted] = [drawn(head, inputs).float().mean() for head in heads]
+    assert min(shares[True]) == 1.0
+    assert max(shares[False]) < 1.0, "as Scaffold-GS draws them, some begin transparent"
 
 
 @pytest.mark.parametrize(("seed", "distance_input"), [(1000005, False), (98, True)])
 def test_no_seed_begins_with_nothing_visible(seed: int, distance_input: bool) -> None:
     """With the first weights of these seeds no Gaussian has a positive opacity, so all anchors would be pruned."""
-
-    def visible(head: HeadWeights) -> bool:
-        directions = torch.nn.functional.normalize(
-            torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1
-        )
-        inputs = torch.cat([torch.zeros(64, 32), directions, torch.ones(64, int(distance_input))], dim=1)
-        return bool((torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2 > 0).any())
-
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    inputs = torch.cat([torch.zeros(64, 32), directions, torch.ones(64, int(distance_input))], dim=1)
     generator = torch.Generator().manual_seed(seed)
-    assert not visible(random_head(35 + int(distance_input), 32, 5, generator))
+    assert not drawn(random_head(35 + int(distance_input), 32, 5, generator), inputs).any()
     generator.manual_seed(seed)
     begun = seeded(torch.rand(100, 3), generator=generator, distance_input=distance_input)
-    assert visible(begun.mlps.opacity)
+    assert drawn(begun.mlps.opacity, inputs).any()
 
 
 def test_the_seed_decides_the_weights() -> None:

@@ -113,7 +113,8 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
 def merged(rules: SpawnRules) -> Spawned:
     """Of points in straight lines of 4, 8 and 3, a voxel apart in a line, lines far from each other."""
     points = torch.tensor([[float(x), 50.0 * row, 0.0] for row, n in enumerate((4, 8, 3)) for x in range(n)])
-    return _merge_points(points, torch.rand(15, 3), torch.ones(15), first_identity=7, rules=rules)
+    values = torch.cat([points, torch.rand(15, 3), torch.ones(15, 1)], dim=1)
+    return _merge_points(values, first_identity=7, rules=rules)
 
 
 @pytest.mark.parametrize(

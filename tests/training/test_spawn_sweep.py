@@ -74,12 +74,9 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
     assert drawings, "without what is known"
 
 
-def test_without_room_nothing_is_spawned_and_with_room_as_much_as_there_is() -> None:
-    swept = sweep()
-    missing = swept.missing()
-    assert not len(swept.spawn(missing, first_identity=0, room=0).free)
-    assert len(swept.spawn(missing, first_identity=0, room=2).free) == 2
-    unsupported = sweep(replace(RULES, min_supports=6)).spawn(missing, first_identity=0, room=9)
+def test_what_too_few_views_miss_is_not_spawned() -> None:
+    swept = sweep(replace(RULES, min_supports=6))
+    unsupported = swept.spawn(swept.missing(), first_identity=0, room=9)
     assert not len(unsupported.free), "six others of six"
     assert not unsupported.refused_count
 
@@ -99,9 +96,9 @@ def test_what_is_found_lies_in_the_middle_of_a_pixel_of_its_view(monkeypatch: py
     """Before points of several views are merged."""
     swept, found, merge = sweep(), list[torch.Tensor](), spawn._merge_points
 
-    def noted(points: torch.Tensor, *arguments: Any, **options: Any) -> Any:
-        found.append(points)
-        return merge(points, *arguments, **options)
+    def noted(values: torch.Tensor, **options: Any) -> Any:
+        found.append(values[:, :3])
+        return merge(values, **options)
 
     monkeypatch.setattr(spawn, "_merge_points", noted)
     swept.spawn(swept.missing(), first_identity=0, room=9)

@@ -9,7 +9,7 @@ import torch
 from structgstream.kernels.backend import Backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
-from structgstream.scene.state import PAPER_DYNAMIC, state_of
+from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.losses import LossWeights, view_loss
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.optimize import SHARED_FIELDS
@@ -20,6 +20,7 @@ from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
 from tests.support.backends import on_each_backend
 from tests.support.rigs import random_scene
+from tests.support.streams import same
 from tests.support.varied import varied
 from tests.support.worlds import moving_world
 
@@ -42,8 +43,7 @@ def test_the_parts_make_the_whole_again() -> None:
     assert len(split.dynamic.anchors) == 2
     assert len(split.dynamic.anchors) + len(split.static.anchors) == 60
     assert len(split.dynamic.free) + len(split.static.free) == 8
-    before, after = state_of(SCENE), state_of(split.merge(split.dynamic))
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert same(split.merge(split.dynamic), SCENE)
 
 
 def test_what_moved_moves_and_births_stay_in_order() -> None:

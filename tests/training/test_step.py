@@ -18,8 +18,8 @@ from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
 
-def loss_of(parameters, scene, **weights):
-    view = View(0, arc_rig()["cam01"], torch.full((32, 48, 3), 90, dtype=torch.uint8))
+def loss_of(parameters, scene, *, grey=90, index=0, **weights):
+    view = View(index, arc_rig()["cam01"], torch.full((32, 48, 3), grey, dtype=torch.uint8))
     loss = view_loss(
         parameters.scene(scene),
         view,

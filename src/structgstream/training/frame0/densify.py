@@ -2,7 +2,7 @@
 """Growing and pruning of anchors in frame 0, after Scaffold-GS (Lu et al., CVPR 2024)."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -120,22 +120,13 @@ class NewAnchors:
         return NewAnchors(**{name: column[rows] for name, column in vars(self).items()})
 
 
-class FreshCells(NamedTuple):
-    """Cells that hold some of ``P`` points and none of others.
+def fresh_cells(points: Tensor, occupied: Tensor, cell: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The cells of side ``cell`` that hold some of ``points`` ``[P, 3]`` and none of ``occupied``, ascending.
 
-    Args:
-        fresh: mask ``[P]`` of the points in such cells.
-        cell_of: ``[p]``, the cell of each of these.
-        cells: ``[C, 3]`` int64, in units of a cell's side.
+    Returns:
+        Mask ``[P]`` of the points in such cells, the cell ``[p]`` of each of these, and the cells ``[C, 3]`` int64 in
+        units of their side.
     """
-
-    fresh: Tensor
-    cell_of: Tensor
-    cells: Tensor
-
-
-def fresh_cells(points: Tensor, occupied: Tensor, cell: float) -> FreshCells:
-    """The cells of side ``cell`` that hold some of ``points`` ``[P, 3]`` and none of ``occupied``, ascending."""
     cells = (torch.cat([points, occupied]) / cell).round().to(torch.int64)
     origin = cells.amin(0)
     x, y, z = (cells - origin).unbind(1)
@@ -144,7 +135,7 @@ def fresh_cells(points: Tensor, occupied: Tensor, cell: float) -> FreshCells:
     fresh = ~torch.isin(keys, others)
     unique, index = keys[fresh].unique(return_inverse=True)
     found = torch.stack([unique // (rows * columns), unique // columns % rows, unique % columns], dim=1)
-    return FreshCells(fresh, index, found + origin)
+    return fresh, index, found + origin
 
 
 def grow(
@@ -231,7 +222,6 @@ class Densifier:
     config: GrowthConfig
     iterations: int
     voxel_size: float
-    offsets_per_anchor: int
     seeds: int
     gradients: GradientStatistics
     opacities: OpacityStatistics
@@ -243,9 +233,7 @@ class Densifier:
         """Empty statistics for ``scene``, which is fitted in ``iterations`` iterations."""
         m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
         device = scene.anchors.positions.device
-        return cls(
-            config, iterations, voxel_size, k, m, GradientStatistics(m * k, device), OpacityStatistics(m, device)
-        )
+        return cls(config, iterations, voxel_size, m, GradientStatistics(m * k, device), OpacityStatistics(m, device))
 
     def collects(self, iteration: int) -> bool:
         """Whether statistics are collected at this iteration."""
@@ -258,7 +246,7 @@ class Densifier:
 
     def apply(self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int) -> None:
         """Grow, then prune, after ``iteration``."""
-        k = self.offsets_per_anchor
+        k = scene.anchors.offsets_per_anchor
         new = grow(
             scene.anchors,
             mean_gradient=self.gradients.mean(),
@@ -279,25 +267,10 @@ class Densifier:
         anchors = AnchorCloud(
             new.positions, log_cells, log_cells, new.positions.new_zeros(len(new), k, 3), new.features
         )
-        self._replace(adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
+        adam.replace_rows(values_of_rows(anchors, ANCHOR_ROWS), keep=keep)
         adam.values["base_scales"].detach().clamp_(max=0.05)
-
-    def _replace(
-        self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int
-    ) -> None:
-        """Keep the rows of a mask ``[M]`` and append ``count`` rows, in all tensors with a row per anchor.
-
-        New rows of parameters that are not in ``added`` are zero.
-        """
-        k = self.offsets_per_anchor
-        new: dict[ParameterName, Tensor] = {}
-        for name, old in adam.values.items():
-            if name in ANCHOR_ROWS:
-                new[name] = added[name] if name in added else old.detach().new_zeros(count, *old.shape[1:])
-        adam.replace_rows(new, keep=keep)
-        for statistics in (self.gradients, self.opacities):
-            rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
-            more = count * k if statistics is self.gradients else count
+        for statistics, per_anchor in ((self.gradients, k), (self.opacities, 1)):
+            rows = keep.repeat_interleave(per_anchor)
             for name, values in vars(statistics).items():
-                setattr(statistics, name, torch.cat([values[rows], values.new_zeros(more)]))
-        self.grown, self.pruned = self.grown + count, self.pruned + int((~keep).sum())
+                setattr(statistics, name, torch.cat([values[rows], values.new_zeros(per_anchor * len(new))]))
+        self.grown, self.pruned = self.grown + len(new), self.pruned + int((~keep).sum())

@@ -17,11 +17,11 @@ from structgstream.frames import RovingPicture
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import Rendering
 from structgstream.scene.scene import Scene
+from structgstream.training.frame0.regularizers import COVERED
 from structgstream.training.views import View, blackened, coarse_to_fine
 
 COLORS_FROM = 0.05  # share of the iterations after which gains follow the renderings
 MAX_GAIN = 2.0
-COVERED = 0.5  # coverage below which a pixel shows no surface yet
 MIN_COUNTING = 0.05  # share of a picture's pixels that gains need
 
 

@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from structgstream.codec.fields.quantization import round_straight_through
-from structgstream.kernels.values import HeadWeights
 from structgstream.scene.color import CameraColor
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
@@ -78,7 +77,7 @@ def with_exposure_of(
         biases = round_straight_through(biases, step)
     if not bool((wanted != so_far).any() & (biases != head.b2).any()):
         return scene
-    return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
+    return replace(scene, mlps=scene.mlps._replace(color=head._replace(b2=biases)))
 
 
 def _light_change(

@@ -316,34 +316,35 @@ def _cut(picture: Tensor, box: Box) -> NDArray[np.uint8]:
     return np.ascontiguousarray(picture[box].numpy())
 
 
-def _box(mask: Mask, context: int) -> list[Box]:
-    """Bounding box of the mask ``[H, W]`` with a margin of ``context`` pixels; none if it is empty or too small for the
-    flow search."""
+def _boxes(mask: Mask, context: int) -> list[Box]:
+    """Disjoint boxes around the parts of the mask ``[H, W]``, with a margin of ``context`` pixels; one around all if
+    that is hardly larger. Boxes that are too small for the flow search are left out."""
     if not mask.any():
         return []
     rows, columns = (np.flatnonzero(mask.any(axis)).tolist() for axis in (1, 0))
     edges = (rows[0] - context, rows[-1] + 1 + context, columns[0] - context, columns[-1] + 1 + context)
-    return _searchable([_within(edges, mask.shape)], context)
-
-
-def _boxes(mask: Mask, context: int) -> list[Box]:
-    """Disjoint boxes with margin around the parts of the mask ``[H, W]``; one around all if that is hardly larger."""
-    one = _box(mask, context)
-    rows, columns = (-(-length // context) for length in mask.shape)
-    padded = np.zeros((rows * context, columns * context), bool)
-    padded[: mask.shape[0], : mask.shape[1]] = mask
+    one = _within(edges, mask.shape)
+    if not _searchable(one, context):
+        return []
     # First down the columns, whose steps are long: NumPy takes ten times as long for both at once.
-    high = padded.reshape(rows, context, -1).any(1)
-    cells = np.logical_or.reduce(high.reshape(rows, columns, context), axis=2)
+    cells = _in_cells(mask, context).any(1).any(2)
     found = [_within((context * a, context * b, context * c, context * d), mask.shape) for a, b, c, d in _parts(cells)]
-    if not one or sum(map(_area, found)) > MIN_SAVING * _area(one[0]):
-        return one
-    return _searchable(found, context)
+    if sum(map(_area, found)) > MIN_SAVING * _area(one):
+        return [one]
+    return [box for box in found if _searchable(box, context)]
 
 
-def _searchable(boxes: list[Box], context: int) -> list[Box]:
-    """Those of ``boxes`` that are not too small for the flow search."""
-    return [box for box in boxes if min(span.stop - span.start for span in box) >= 2 * context]
+def _searchable(box: Box, context: int) -> bool:
+    """Whether ``box`` is not too small for the flow search."""
+    return min(span.stop - span.start for span in box) >= 2 * context
+
+
+def _in_cells(mask: Mask, side: int) -> Mask:
+    """The mask ``[H, W]``, padded to whole cells, as ``[rows, side, columns, side]``."""
+    rows, columns = (-(-length // side) for length in mask.shape)
+    padded = np.zeros((rows * side, columns * side), bool)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    return padded.reshape(rows, side, columns, side)
 
 
 def _far_boxes(changed: Mask, consistent: Mask, cell: int) -> list[Box]:
@@ -356,10 +357,7 @@ def _far_boxes(changed: Mask, consistent: Mask, cell: int) -> list[Box]:
     """
     import cv2  # The flow search has refused to go on without it.
 
-    rows, columns = (-(-length // cell) for length in changed.shape)
-    padded = np.zeros((2, rows * cell, columns * cell), bool)
-    padded[:, : changed.shape[0], : changed.shape[1]] = changed, changed & consistent
-    count, found = padded.reshape(2, rows, cell, columns, cell).sum((2, 4))
+    count, found = (_in_cells(mask, cell).sum((1, 3)) for mask in (changed, changed & consistent))
     missed = (count >= cell**2 / 2) & (found < CONSISTENT_SHARE * count)
     missed = cv2.morphologyEx(missed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((MISSED_CELLS, MISSED_CELLS), np.uint8))
     reach = REACH_CELLS * cell

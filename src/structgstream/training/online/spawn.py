@@ -123,8 +123,7 @@ def spawn_by_sweep(
     found = found[cost < rules.max_cost]
     if not len(found):
         return none
-    points, colors, spacings = found.split([3, 3, 1], dim=1)
-    spawned = _merge_points(points, colors, spacings[:, 0], first_identity=first_identity, rules=rules)
+    spawned = _merge_points(found, first_identity=first_identity, rules=rules)
     return replace(spawned, free=spawned.free.to(like.device))
 
 
@@ -138,11 +137,12 @@ def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> Swee
     return SweepView(colors, entry.missing_share, depths, viewport.viewmat, viewport.K, camera.near)
 
 
-def _merge_points(
-    points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
-) -> Spawned:
-    """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it; on the processor."""
-    values, spacing = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
+def _merge_points(values: Tensor, *, first_identity: int, rules: SpawnRules) -> Spawned:
+    """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it; on the processor.
+
+    A row of ``values`` ``[P, 7]`` is a point, its colour, and the distance between neighbouring swept rays there.
+    """
+    points, spacing = values[:, :3], float(values[:, 6].median())
     tree, voxel, finest = kd_tree(points), spacing, None
     while True:
         means, hits = _cells(values, tree, voxel)
