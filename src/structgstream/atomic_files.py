@@ -224,6 +224,15 @@ def name_finished(path: Path) -> None:
     GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
 
 
+def name_unfinished(path: Path) -> None:
+    """Renames a finished file that is damaged, so that its writer continues it. Raises StorageError if it cannot be
+    renamed."""
+    try:
+        path.replace(partial_path(path))
+    except OSError as error:
+        raise StorageError(f"{path} cannot be renamed ({error.strerror}); correct its permissions.") from None
+
+
 def remove_unused(path: Path) -> None:
     """Removes a file and its partial file, if they exist. Raises StorageError if another process writes it, which would
     otherwise give the next writer's partial file its name, or it cannot be removed."""

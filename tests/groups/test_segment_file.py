@@ -246,6 +246,15 @@ def test_cut_and_flipped_anywhere_it_goes_on_to_the_same_bytes(
     assert not partial_path(path).exists()
 
 
+def test_a_damaged_segment_that_cannot_be_renamed(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    path.write_bytes(whole()[:-30])
+    (partial_path(path) / "full").mkdir(parents=True)
+    with pytest.raises(StorageError, match="cannot be renamed"):
+        resume_segment(path, base(), IDENTITY)
+    assert path.read_bytes() == whole()[:-30]
+
+
 def test_a_finished_segment_is_left(tmp_path: Path) -> None:
     path = tmp_path / "g.sgs"
     path.write_bytes(whole())

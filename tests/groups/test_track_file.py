@@ -10,11 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.atomic_files import partial_path
+from structgstream.codec.container.records import packed
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.track_file import (
     PREFIX,
     SIGNATURE,
     TrackHead,
+    TrackRecord,
     TrackStart,
     TrackWriter,
     check_length,
@@ -23,6 +25,7 @@ from structgstream.groups.track_file import (
     open_track,
     quiet_groups,
     read_groups,
+    track_bytes,
     write_groups,
 )
 from tests.support.killed import folders_of_the_killed
@@ -116,6 +119,14 @@ def test_what_is_no_track_is_refused(tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(StreamError, match=said):
             open_track(path)
+
+
+@pytest.mark.parametrize("content", ["{}", '{"groups": 3}', '{"groups": [[0]]}', "[" * 9999])
+def test_an_end_that_does_not_follow_the_format(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "t"
+    path.write_bytes(track_bytes(HEAD, start(4)) + packed(TrackRecord.END, content.encode()))
+    with pytest.raises(StreamError, match="The end of the track .* does not follow the format"):
+        open_track(path)
 
 
 @examples(60)

@@ -310,6 +310,8 @@ def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:
     first = parts.run
     parts.use_plan({"capture": "a"})
     assert parts.run == first != ""
+    (parts.folder / "plan.json").write_text("[" * 9999)
+    assert parts.run == ""
     with parts.locked():
         parts.clear()
     parts.use_plan({"capture": "a"})

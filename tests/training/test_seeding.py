@@ -62,7 +62,7 @@ def test_every_gaussian_can_begin_drawn_whatever_camera_looks() -> None:
 
 
 @pytest.mark.parametrize(("seed", "distance_input"), [(1000005, False), (98, True)])
-def test_no_seed_begins_with_nothing_visible(seed: int, distance_input: bool) -> None:
+def test_no_seed_begins_with_nothing_visible(seed: int, distance_input: bool, caplog: pytest.LogCaptureFixture) -> None:
     """With the first weights of these seeds no Gaussian has a positive opacity, so all anchors would be pruned."""
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     inputs = torch.cat([torch.zeros(64, 32), directions, torch.ones(64, int(distance_input))], dim=1)
@@ -71,6 +71,7 @@ def test_no_seed_begins_with_nothing_visible(seed: int, distance_input: bool) ->
     generator.manual_seed(seed)
     begun = seeded(torch.rand(100, 3), generator=generator, distance_input=distance_input)
     assert drawn(begun.mlps.opacity, inputs).any()
+    assert "they are drawn again" in caplog.text
 
 
 def test_the_seed_decides_the_weights() -> None:

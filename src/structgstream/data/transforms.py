@@ -69,9 +69,12 @@ def find(folder: Path) -> tuple[Path, ...]:
 
 def read(files: tuple[Path, ...]) -> Calibration:
     """A camera for each picture of the files."""
-    shots = read_shots(files)
+    return _calibration(files[0], read_shots(files))
+
+
+def _calibration(file: Path, shots: Sequence[Shot]) -> Calibration:
     held_out = [shot.camera.name for shot in shots if shot.held_out]
-    return Calibration(files[0], tuple(shot.camera for shot in shots), held_out=held_out)
+    return Calibration(file, tuple(shot.camera for shot in shots), held_out=held_out)
 
 
 def read_shots(files: tuple[Path, ...]) -> list[Shot]:
@@ -167,7 +170,7 @@ def open_transforms(path: Path) -> FrameSource:
     if any(shot.masked for shot in shots) and not masks_folder(path).is_dir():
         log.warning("%s names masks (mask_path), which are not read; copy them to masks/CAMERA/FRAME.png", files[0])
     if files[0].name == WHOLE and any(shot.time is None for shot in shots):
-        return open_posed(path, read(files), fps=stated_fps(files[0]))
+        return open_posed(path, _calibration(files[0], shots), fps=stated_fps(files[0]))
     cameras = _by_pose(shots, files[0])
     zero = min([0.0, *(shot.time for shot in shots if shot.time is not None)])
     pictures = {name: _instants(own, zero) for name, own in cameras.items()}

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from structgstream.atomic_files import GrowingFile, name_finished, partial_path
+from structgstream.atomic_files import GrowingFile, name_finished, name_unfinished, partial_path
 from structgstream.codec.container.byte_source import FileBytes, check_room, free_bytes
 from structgstream.codec.container.records import (
     FRAME,
@@ -270,14 +270,13 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
 
     Raises:
         ConfigError: the existing file was fitted from something else, or is a stream.
-        StorageError: an unfinished file with all frames cannot be renamed, or another process writes it.
-        OSError: a damaged finished file cannot be renamed.
+        StorageError: the file cannot be renamed, or another process writes it.
     """
     if path.exists():
         found = _matching(path, base, identity)
         if found is not None and found.complete:
             return found
-        path.replace(partial_path(path))
+        name_unfinished(path)
     found = _matching(partial_path(path), base, identity) if partial_path(path).exists() else None
     if found is not None and found.complete:
         name_finished(path)

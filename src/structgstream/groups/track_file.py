@@ -135,7 +135,10 @@ class TrackFile:
             offset += found.bytes
         last = read_record(self._data, offset)
         if last is not None and last.type == TrackRecord.END:
-            self.groups = [(first, end) for first, end in json.loads(last.payload)["groups"]]
+            try:
+                self.groups = [(int(first), int(end)) for first, end in json.loads(last.payload)["groups"]]
+            except (ValueError, KeyError, TypeError, RecursionError) as error:
+                raise StreamError(f"The end of the track {self._name} does not follow the format ({error}).") from error
 
     def start(self, frame: int) -> TrackStart:
         """The start record of ``frame``. Raises StreamError if the pass has stored no start at this frame, or it is

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from structgstream.atomic_files import name_finished, partial_path
+from structgstream.atomic_files import name_finished, name_unfinished, partial_path
 from structgstream.data.source import FrameSource, read_ahead
-from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase, fingerprint
 from structgstream.groups.segment_file import GroupSoFar, Segment
 from structgstream.groups.track_file import (
@@ -169,10 +169,7 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
             "another name, or --overwrite."
         )
     if found.groups is None and path.exists():
-        try:
-            path.replace(partial_path(path))  # A finished track that was damaged at its end becomes an unfinished one.
-        except OSError as error:
-            raise StorageError(f"{path} cannot be renamed ({error.strerror}); correct its permissions.") from None
+        name_unfinished(path)  # It is damaged at its end.
     return found
 
 

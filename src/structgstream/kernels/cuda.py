@@ -134,7 +134,10 @@ def lift(
     (views, dynamic), (targets, count) = seen.weights.shape, neighbors.rows.shape
     assert centers.shape == (dynamic, 3), centers.shape
     assert seen.flows.shape == (views, dynamic, 2), seen.flows.shape
+    assert neighbors.affinities.shape == (targets, count), neighbors.affinities.shape
     assert priors.shape == (targets, 3), priors.shape
+    assert seen.viewmats.shape == (views, 4, 4), seen.viewmats.shape
+    assert seen.Ks.shape == (views, 3, 3), seen.Ks.shape
     tensors = [constant(centers), *map(constant, seen), neighbors.rows.to(torch.int64).contiguous()]
     tensors += [constant(neighbors.affinities), constant(priors)]
     found = Lifted(

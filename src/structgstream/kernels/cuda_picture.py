@@ -310,7 +310,9 @@ def rasterize(
     if any(tensor.dtype != torch.float32 for tensor in given):
         raise BackendError("The cuda back-end draws float32 Gaussians; convert them, or take the reference back-end.")
     if onto is not None:
+        assert onto.shape == (viewport.height, viewport.width, 3)
         assert onto.is_contiguous()
+        assert not onto.requires_grad
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     scenery = Scenery.of(gaussians, viewport, background, tiles, trained)
     offsets = None if screen_offsets is None else screen_offsets.contiguous()

@@ -69,7 +69,8 @@ def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) ->
     return covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
 
 
-def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:
+def head_outputs(weights: HeadWeights, inputs: Tensor) -> Tensor:
+    """Outputs of an MLP with one hidden layer, before any activation."""
     hidden = torch.relu(torch.nn.functional.linear(inputs, weights.w1, weights.b1))
     return torch.nn.functional.linear(hidden, weights.w2, weights.b2)
 
@@ -111,10 +112,10 @@ def activate_anchors(
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)  # An anchor may lie at the camera's centre.
     parts = [features[visible], to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
-    opacity = torch.tanh(_head(mlps.opacity, inputs))  # [m, K]
+    opacity = torch.tanh(head_outputs(mlps.opacity, inputs))  # [m, K]
     drawn = (opacity.reshape(-1) > 0).nonzero()[:, 0]
-    color = torch.sigmoid(_head(mlps.color, inputs)).reshape(-1, 3)[drawn]
-    covariance = _head(mlps.covariance, inputs).reshape(-1, 7)[drawn]
+    color = torch.sigmoid(head_outputs(mlps.color, inputs)).reshape(-1, 3)[drawn]
+    covariance = head_outputs(mlps.covariance, inputs).reshape(-1, 7)[drawn]
     anchor = visible[drawn // k]
     offset = offsets[anchor, drawn % k]
     gaussians = Gaussians(

@@ -18,6 +18,7 @@ colour in every iteration (``InitialConfig.random_background``) only opaque surf
 stays transparent is unobserved.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ from structgstream.environment import pixel_directions
 from structgstream.errors import CaptureError
 from structgstream.harmonics import sh_basis
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.reference_anchors import head_outputs
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -40,6 +42,8 @@ from structgstream.scene.scene import Scene
 from structgstream.training.frame0.densify import fresh_cells
 from structgstream.training.neighbours import kd_tree, nearest
 from structgstream.training.views import View
+
+log = logging.getLogger(__name__)
 
 
 def voxel_centers(points: Tensor, voxel_size: float) -> Tensor:
@@ -78,8 +82,7 @@ def _visible_share(opacity: HeadWeights, feature_width: int) -> float:
     around = torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], dim=1)
     inputs = torch.ones(len(around), opacity.w1.shape[1])
     inputs[:, :feature_width], inputs[:, feature_width : feature_width + 3] = 0.0, around
-    outputs = torch.relu(inputs @ opacity.w1.T + opacity.b1) @ opacity.w2.T + opacity.b2
-    return float((outputs > 0.0).any(1).float().mean())
+    return float((head_outputs(opacity, inputs) > 0.0).any(1).float().mean())
 
 
 def seeded_scene(
@@ -117,6 +120,7 @@ def seeded_scene(
     if all_drawn:
         heads[0] = heads[0]._replace(w2=heads[0].w2.abs(), b2=heads[0].b2.abs())
     while _visible_share(heads[0], feature_width) < MIN_VISIBLE_SHARE:
+        log.warning("frame 0: with the first weights of F_alpha hardly any Gaussian is visible; they are drawn again")
         heads[0] = random_head(inputs, hidden_width, k, generator)
     opacity, color, covariance = (HeadWeights(*(w.to(device) for w in head)) for head in heads)
     return Scene(
