@@ -5,8 +5,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
+from typing import Any
 
 import pytest
 
@@ -87,17 +88,19 @@ def test_ignored_as_under_nohup_it_stays_ignored() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_another_thread_has_no_signals() -> None:
-    seen = []
+@pytest.mark.parametrize("block", [interruptible, StopSignal])
+def test_another_thread_has_no_signals(block: Callable[[], AbstractContextManager[Any]]) -> None:
+    before, seen = signal.getsignal(signal.SIGTERM), []
 
     def run() -> None:
-        with interruptible():
-            seen.append(signal.getsignal(signal.SIGINT))
+        with block():
+            seen.append((signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)))
 
     thread = threading.Thread(target=run)
     thread.start()
     thread.join()
-    assert seen == [signal.default_int_handler]
+    assert seen == [(signal.default_int_handler, before)]
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize(
@@ -133,17 +136,3 @@ def test_what_was_there_before_comes_back_however_the_block_ends() -> None:
         assert heard == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def test_another_thread_has_no_signals_and_changes_nothing() -> None:
-    before, found = signal.getsignal(signal.SIGTERM), []
-
-    def run() -> None:
-        with StopSignal() as ending:
-            found.append((ending.asked, signal.getsignal(signal.SIGTERM)))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    assert found == [(False, before)]
-    assert signal.getsignal(signal.SIGTERM) is before

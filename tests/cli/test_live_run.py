@@ -20,16 +20,14 @@ from structgstream.recorder import RunMetrics
 from structgstream.training.result import Step
 from tests.data.live.test_live_source import files
 from tests.support.consoles import console, text
-from tests.support.quick_streams import Runner
+from tests.support.quick_streams import QUICK, Runner
 from tests.support.reports import frame_report
-
-QUICKLY = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2", "--device", "cpu"]
 
 
 @pytest.fixture
 def live(tmp_path: Path, quick_tiny: None) -> list[str]:
     """The command, of a rig of three cameras."""
-    return ["reconstruct", str(files(tmp_path, frames=60)), "-o", str(tmp_path / "x.sgs"), "--live", *QUICKLY]
+    return ["reconstruct", str(files(tmp_path, frames=60)), "-o", str(tmp_path / "x.sgs"), "--live", *QUICK]
 
 
 def test_a_live_run_is_a_stream_a_log_metrics_and_a_recording(live: list[str], tmp_path: Path, run: Runner) -> None:

@@ -161,6 +161,7 @@ def test_a_wrong_capture_leaves_nothing_behind(tmp_path: Path, run: Runner) -> N
     ("options", "device", "gpus", "words"),
     [
         (WorkerOptions(workers=1, threads=1), "cpu", 0, ("--device", "cpu", "--workers", "1")),
+        (WorkerOptions(), "cpu", 0, ("--device", "cpu", "--workers", str(usable_cores()))),
         (WorkerOptions("ray"), "cpu", 0, ("--device", "cpu")),
         (WorkerOptions("ray"), "cuda", 0, ("--device", "auto")),
         (WorkerOptions("ray"), "cuda", 1, ("--device", "cuda")),
@@ -172,10 +173,6 @@ def test_joining_takes_what_this_machine_has_and_no_more_processes_than_the_run_
 ) -> None:
     monkeypatch.setattr(parallel, "gpus_of", lambda device: gpus)
     assert join_arguments(options, device) == words
-
-
-def test_joining_takes_all_cores_that_the_workers_have() -> None:
-    assert join_arguments(WorkerOptions(), "cpu") == ("--device", "cpu", "--workers", str(usable_cores()))
 
 
 @pytest.fixture

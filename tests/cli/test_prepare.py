@@ -4,7 +4,6 @@
 import json
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -73,34 +72,27 @@ def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     ]  # fmt: skip
 
 
-def hidden(path: Path) -> None:
-    path.chmod(0)
-
-
-def read_only(path: Path) -> None:
-    path.chmod(0o555)
+HIDDEN, READ_ONLY = 0, 0o555
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
 @pytest.mark.parametrize(
-    ("place", "change", "said"),
+    ("place", "mode", "said"),
     [
-        ("videos/cam02.mp4", hidden, "The video {place} cannot be opened (Permission denied); let yourself read it."),
+        ("videos/cam02.mp4", HIDDEN, "The video {place} cannot be opened (Permission denied); let yourself read it."),
         (
             "videos/cameras.json",
-            hidden,
+            HIDDEN,
             "{place} cannot be read (Permission denied); expected width, height and cameras",
         ),
-        ("videos", hidden, "no permission for {place}; change its permissions"),
-        ("videos/masks", hidden, "no permission for {place}; change its permissions"),
-        ("out", hidden, "no permission for {place}"),
-        ("out", read_only, "The folder {place} cannot be written (Permission denied)."),
-        ("out/work", read_only, "The folder {folder}/out cannot be written (Permission denied)."),
+        ("videos", HIDDEN, "no permission for {place}; change its permissions"),
+        ("videos/masks", HIDDEN, "no permission for {place}; change its permissions"),
+        ("out", HIDDEN, "no permission for {place}"),
+        ("out", READ_ONLY, "The folder {place} cannot be written (Permission denied)."),
+        ("out/work", READ_ONLY, "The folder {folder}/out cannot be written (Permission denied)."),
     ],
 )
-def test_what_may_not_be_read_or_written(
-    tmp_path: Path, place: str, change: Callable[[Path], None], said: str, run: Runner
-) -> None:
+def test_what_may_not_be_read_or_written(tmp_path: Path, place: str, mode: int, said: str, run: Runner) -> None:
     """One sentence that names it, and nothing of the input is changed."""
     write_room(tmp_path / "videos")
     for folder in ("videos/masks", "out"):
@@ -109,13 +101,13 @@ def test_what_may_not_be_read_or_written(
         mark_output(tmp_path / "out", tmp_path / "videos")
     before = {path: path.read_bytes() for path in (tmp_path / "videos").iterdir() if path.is_file()}
     path = tmp_path / place
-    mode = path.stat().st_mode
-    change(path)
+    usual = path.stat().st_mode
+    path.chmod(mode)
     try:
         command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
         error = run(command, status=1).err
     finally:
-        path.chmod(mode)
+        path.chmod(usual)
     assert error.removeprefix("structgstream: ").startswith(said.format(place=path, folder=tmp_path))
     assert error.count("\n") == 1
     assert {path: path.read_bytes() for path in before} == before

@@ -36,13 +36,11 @@ def test_side_by_side_is_truth_rendering_difference() -> None:
     assert row == [100] * 6 + [255] * 4 + [110] * 6 + [255] * 4 + [40] * 6
 
 
-def test_thumbnails_are_block_means() -> None:
-    picture = np.zeros((6, 2 * LARGEST_TILE, 3), np.uint8)
-    picture[:2, :2] = [[[0], [100]], [[100], [200]]]
-    small = thumbnail(picture)
+def test_thumbnails_are_as_wide_as_a_tile_at_most() -> None:
+    """What their pixels are: test_metrics.py."""
+    small = thumbnail(np.zeros((6, 2 * LARGEST_TILE, 3), np.uint8))
     assert small.shape == (3, LARGEST_TILE, 3)
-    assert small[0, 0, 0] == 100
-    np.testing.assert_array_equal(thumbnail(small), small)
+    assert thumbnail(small).shape == small.shape
 
 
 def test_sampled_frames_hold_the_first_and_the_last() -> None:

@@ -220,8 +220,6 @@ def first_sentences(kind: type) -> dict[str, str]:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                     plain = re.sub(r":\w+:|`", "", " ".join(text.split()))
                     found[name] = re.split(r"(?<=\.) (?=[A-Z0-9])", plain)[0]
-                case _:
-                    pass
     return found
 
 

@@ -4,7 +4,7 @@
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
@@ -229,7 +229,7 @@ class Bars:
 MIN_SHOWN_SECONDS = 0.05
 
 
-class StepDisplay(AbstractContextManager["StepDisplay"]):
+class StepDisplay:
     """A listener of steps; bars are shown on a terminal only."""
 
     def __init__(self, console: Console) -> None:

@@ -116,8 +116,6 @@ class Compared:
 EVALUATION = "evaluation"
 """Name of the scoring stage in measurements of memory."""
 
-Observer = Callable[[int, Compared], None]
-
 
 def evaluate(
     recording: Recording,
@@ -126,7 +124,7 @@ def evaluate(
     backend: Backend,
     cameras: tuple[str, ...] | None = None,
     log: Mapping[int, Mapping[str, Any]] | None = None,
-    observer: Observer | None = None,
+    observer: Callable[[int, Compared], None] | None = None,
     metrics: MetricSelection = "all",
     lpips_weights: Path | None = None,
     stored: FrameSource | None = None,

@@ -114,8 +114,8 @@ class FourDgsFile:
         import_extra("fourdgs", "export")
         self._fps = fps
         self._frames: list[dict[str, np.ndarray]] = []
-        self._starts: list[float] = []  # of the frames, seconds after the first
-        self._first, self._degree = 0.0, 0
+        self._seconds: list[float] = []  # presentation times of the frames
+        self._degree = 0
 
     def add(self, seconds: float, gaussians: BakedGaussians) -> None:
         """Add the frame presented at ``seconds``: OpenCV axes, in the units of the file."""
@@ -123,9 +123,7 @@ class FourDgsFile:
 
         gaussians = gaussians.y_up()
         self._degree = gaussians.degree
-        if not self._starts:
-            self._first = seconds
-        self._starts.append(seconds - self._first)
+        self._seconds.append(seconds)
         count = len(gaussians)
         rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1).cpu().numpy()
         color = (0.5 + Y0 * gaussians.sh[:, 0]).clamp(0.0, 1.0).cpu().numpy()
@@ -145,8 +143,9 @@ class FourDgsFile:
         """Write the file."""
         from fourdgs import GaussianSet, WriteOptions, write
 
-        duration = self._starts[-1] + 1 / self._fps
-        for frame, start, end in zip(self._frames, self._starts, [*self._starts[1:], duration], strict=True):
+        starts = [seconds - self._seconds[0] for seconds in self._seconds]
+        duration = starts[-1] + 1 / self._fps
+        for frame, start, end in zip(self._frames, starts, [*starts[1:], duration], strict=True):
             begins = np.full(len(frame["positions"]), start)
             frame |= {"win_lo": begins, "win_hi": np.full_like(begins, end), "mu_t": begins}
         columns = {name: np.concatenate([frame[name] for frame in self._frames]) for name in self._frames[0]}
