@@ -101,17 +101,22 @@ def atomic_write(
 
 
 @contextmanager
-def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
+def atomic_file(
+    path: Path, *, check: Callable[[Path], object] | None = None, new_folder: bool = False
+) -> Iterator[BinaryIO]:
     """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
 
     Before that ``check`` is called with the path of the complete partial file; if it raises, an existing file is not
-    affected. Raises StorageError as :func:`atomic_write`.
+    affected. With ``new_folder`` a missing folder is created. Raises StorageError as :func:`atomic_write`.
     """
-    with _as_storage_error(path, ""), replacing(path) as file:
-        yield file
-        if check is not None:
-            file.flush()
-            check(partial_path(path.resolve() if path.is_symlink() else path))
+    with _as_storage_error(path, ""):
+        if new_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            yield file
+            if check is not None:
+                file.flush()
+                check(partial_path(path.resolve() if path.is_symlink() else path))
 
 
 @contextmanager

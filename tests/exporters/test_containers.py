@@ -15,7 +15,7 @@ from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import Format, FrameOptions
 from structgstream.exporters.web import glb_bytes
-from structgstream.exporters.write import open_output
+from structgstream.exporters.write import FRAMES_FILES, open_output
 from structgstream.harmonics import Y0
 from tests.support.plain import RIG, picture, psnr, some
 
@@ -169,4 +169,16 @@ def test_a_frame_that_no_file_can_hold_leaves_no_file(format: Format, tmp_path: 
     bad = replace(some(3), means=torch.full((3, 3), torch.nan))
     with pytest.raises(StreamError, match="The means of 3 of 3"):
         write_all(tmp_path / f"x.{format}", format, [bad])
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("format", ["usd", "4dgs"])
+def test_an_interruption_leaves_no_file(format: Format, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(collected: object, path: Path) -> None:
+        path.write_bytes(b"part")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FRAMES_FILES[format], "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_all(tmp_path / f"x.{format}", format, [some(3)])
     assert not [*tmp_path.iterdir()]

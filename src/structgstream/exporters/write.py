@@ -210,8 +210,7 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
         yield collect
         _save(collected, output)
     elif output.suffix.lower() == ".zip" and not folder:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        with atomic_file(output, new_folder=True) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
 
             def add(number: int, seconds: float, gaussians: BakedGaussians) -> Path:
                 check_finite(gaussians)
@@ -249,7 +248,7 @@ def _save(collected: FramesFile, output: Path) -> None:
         output.parent.mkdir(parents=True, exist_ok=True)
         collected.save(partial)
         give_name(partial, output)
-    except Exception as error:
+    except BaseException as error:
         with suppress(OSError):
             partial.unlink()
         if isinstance(error, OSError):
