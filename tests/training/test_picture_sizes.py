@@ -110,7 +110,7 @@ def test_the_tiles_that_are_drawn_reach_as_far() -> None:
     assert widths == [[3 * TILE_PIXELS] * 4, [2.5 * TILE_PIXELS] * 4]
 
 
-def test_floors_and_light_are_compared_at_one_size() -> None:
+def test_baselines_and_exposures_are_compared_at_one_size() -> None:
     backend = quickest_backend()
     baselines = [baseline_residual(WORLD.scene, views(0, n), scale=0.5, backend=backend).maps for n in SIZES]
     lights = [exposure_reference(WORLD.scene, views(0, n), config=ExposureConfig()).views for n in SIZES]

@@ -62,7 +62,7 @@ def test_an_emerging_ball_is_spawned_where_it_is(build: Callable[[], Backend]) -
     torch.testing.assert_close(spawned.logit_opacities.sigmoid(), torch.full((len(spawned),), 0.7))
 
 
-def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_floor_is_eased() -> None:
+def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_baseline_is_capped() -> None:
     baseline = baseline_residual(WORLD.scene, WORLD.views(), scale=1.0, backend=BACKEND)
     bad = replace(baseline, maps={i: torch.full_like(of_view, 0.02) for i, of_view in baseline.maps.items()})
     for of_view in bad.maps.values():

@@ -53,7 +53,7 @@ def test_gradients_of_a_recorded_rendering_are_those_of_its_formula() -> None:
     torch.testing.assert_close(found, expected)
 
 
-def test_the_floor_is_what_frame_0_missed_nearby() -> None:
+def test_the_baseline_is_what_frame_0_missed_nearby() -> None:
     spoiled = views()
     image = spoiled[1].image.clone()
     image[10, 20] = 255 - image[10, 20]
@@ -65,7 +65,7 @@ def test_the_floor_is_what_frame_0_missed_nearby() -> None:
     assert not more[:6].any()
 
 
-def test_the_floor_is_at_most_the_usual_one_where_pictures_have_changed() -> None:
+def test_the_baseline_is_at_most_the_usual_one_where_pictures_have_changed() -> None:
     baseline = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 1.0]])  # The last pixel is masked.
     changed = torch.tensor([[True, True, True, True, False, False]])
     capped = BaselineResidual(1.0, {3: baseline, 4: baseline}).capped({3: changed}, medians=1.0).maps
@@ -103,7 +103,7 @@ def test_what_frame_0_already_missed_does_not_count() -> None:
     assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, baseline=free_of_it).anchors.any()
 
 
-def test_masked_pixels_miss_nothing_and_their_floor_is_out_of_reach() -> None:
+def test_masked_pixels_miss_nothing_and_their_baseline_is_out_of_reach() -> None:
     mask = torch.ones(32, 48, dtype=torch.bool)
     mask[5:20, 10:30] = False
     spoiled = [replace(view, image=blackened(view.image, mask), mask=mask) for view in views(0)]

@@ -132,7 +132,7 @@ def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
         assert found.visible[back.index].any()
 
 
-def test_a_camera_without_a_floor_votes_by_its_pictures_alone() -> None:
+def test_a_camera_without_a_baseline_votes_by_its_pictures_alone() -> None:
     """It was absent from frame 0, and its residuals, being of unknown origin, would make everything move."""
     views, before = (WORLD.views(t) for t in (1, 0))
     dark = [
